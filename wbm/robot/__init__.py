@@ -1,0 +1,1 @@
+"""What the robot is: joints, limits, frames, collision geometry, and the policy's interface."""
