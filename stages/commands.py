@@ -38,9 +38,16 @@ def emit(document: Any) -> None:
 
 
 def run_command(
-    stage: str | None, overrides: list[str], cfg: bool, info: bool, multirun: bool, launcher: str, detach: bool, force: bool,
+    stage: str | None,
+    overrides: list[str],
+    cfg: bool,
+    info: bool,
+    multirun: bool,
+    launcher: str,
+    detach: bool,
+    force: bool,
     as_json: bool,
-) -> None:  # fmt: skip
+) -> None:
     """Run one stage, or all of them when `stage` is None."""
     if launcher not in ("local", "slurm"):
         raise ConfigError(f"--launcher {launcher}: choose local or slurm")

@@ -1,4 +1,4 @@
-"""Turns a tree of plain values into frozen dataclasses, strictly: unknown keys and wrong types are errors of one line."""
+"""Turns plain values into frozen dataclasses, strictly: unknown keys and wrong types are errors of one line."""
 
 from __future__ import annotations
 

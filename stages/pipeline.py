@@ -101,9 +101,8 @@ def run_node(node: Node, store: Store, progress: Progress, *, force: bool = Fals
     progress.message(f"{node.stage.name} {node.ref}: running {because(reasons)}")
     artifact = _execute(node, store, progress, force)
     if node.done and node.done.content_digest != artifact.manifest.content_digest:
-        progress.message(
-            f"WARNING {artifact.ref}: the forced run gave other bytes than before: {_first_change(node.done, artifact.manifest)}"
-        )
+        change = _first_change(node.done, artifact.manifest)
+        progress.message(f"WARNING {artifact.ref}: the forced run gave other bytes than before: {change}")
     node.done, node.reasons = artifact.manifest, []
     return Outcome(node, "ran", time.monotonic() - began, artifact.manifest)
 

@@ -7,7 +7,8 @@ A stage module is light to import (torch, warp and mujoco are imported inside `r
     INPUTS: tuple[str, ...]      input slots: "assets", "teacher/*" (the whole suite), "policy:student" (slot:kind)
     def name(cfg) -> str         name of the artifact under this configuration
     def run(cfg, inputs, draft, progress) -> None
-    EACH: tuple[str, str]        optional ("teacher", "teachers"): in `wbm run`, once for each entry of `teachers`, with `teacher=ENTRY`
+    EACH: tuple[str, str]        optional: ("teacher", "teachers") makes `wbm run` run the stage once for each ENTRY of
+                                 `teachers`, with the override `teacher=ENTRY`
 """
 
 from __future__ import annotations

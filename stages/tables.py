@@ -36,8 +36,11 @@ def metrics_text(metrics: dict[str, Any], limit: int = _MAX_METRICS) -> str:
 
 def results_table(outcomes: Sequence[Outcome], root: Path | None = None) -> str:
     """Stages with states, times and metrics, then the paths of the report and the bundle."""
-    rows = [[o.node.stage.name, o.manifest.ref, o.state, seconds(o.manifest.wall_time_s), metrics_text(o.manifest.metrics)]
-            for o in outcomes]  # fmt: skip
+    rows = [
+        [o.node.stage.name, m.ref, o.state, seconds(m.wall_time_s), metrics_text(m.metrics)]
+        for o in outcomes
+        for m in (o.manifest,)
+    ]
     text = "\n" + table(["stage", "artifact", "state", "time", "metrics"], rows)
     for outcome in outcomes:
         folder = (

@@ -59,9 +59,10 @@ class Backend(Protocol):
         ...
 
     def publish(self, staged: Path, ref: str, *, replace: bool, guard: Callable[[], None]) -> None:
-        """Make a finished staging folder visible as `ref`, all of it or nothing; `guard` raises if the writer lost its lease.
+        """Make a finished staging folder visible as `ref`, all of it or nothing.
 
-        With `replace`, an artifact of that name takes the staging folder's place.
+        With `replace`, an artifact of that name takes the staging folder's place. `guard` raises when the writer has
+        lost its lease.
         """
         ...
 

@@ -77,8 +77,8 @@ def digest_file(path: Path) -> str:
 def digest_content(path: Path) -> str:
     """Hex digest of what a file means, where its bytes also hold names or metadata.
 
-    Tensors are taken one by one: a `.safetensors` file without its free-form metadata, the members of an `.npz` or a torch
-    archive without time stamps and without the archive's own name. Other files count as their bytes.
+    Tensors are taken one by one: a `.safetensors` file without its free-form metadata, the members of an `.npz` or a
+    torch archive without time stamps and without the archive's own name. Other files count as their bytes.
 
     Raises:
         ValueError: a tensor file whose header is damaged.

@@ -44,8 +44,8 @@ class Draft:
     """An artifact in the making.
 
     Attributes:
-        path: staging folder; what it holds at `publish` becomes the artifact. It is the same for the same key, so that an
-            interrupted stage finds its finished shards again. Files below `logs/` are kept but are no part of the content.
+        path: staging folder; what it holds at `publish` becomes the artifact. It is the same for the same key, so that
+            an interrupted stage finds its finished shards again. Files below `logs/` are no part of the content.
         scratch: folder for checkpoints and other state of the running stage; it survives interruption, not publication.
         metrics: numbers for the manifest and the final table.
         seeds: seeds in use, for the manifest.

@@ -1,4 +1,4 @@
-"""Zarr v3 arrays, sharded, Blosc/Zstd: a writer whose unit is a whole shard, and a reader that trusts the manifest only.
+"""Sharded Zarr v3 arrays: a writer whose unit is a whole shard, a reader that trusts the manifest only.
 
 A missing shard reads back as zeros in Zarr, without an error. So every shard is written even when it is all zeros, and
 opening an array for reading checks that each shard of its grid is listed in the manifest and lies on the disk.
