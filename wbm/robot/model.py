@@ -161,7 +161,13 @@ def load_robot() -> RobotModel:
     def hand_dof(joint: dict) -> _Dof:
         act = leap[joint["name"]]
         return _Dof(
-            tuple(joint["range"]), float(act["kp"]), float(act["kv"]), HAND_EFFORT, 0.0, joint["damping"], joint["frictionloss"]
+            tuple(joint["range"]),
+            float(act["kp"]),
+            float(act["kv"]),
+            HAND_EFFORT,
+            0.0,
+            joint["damping"],
+            joint["frictionloss"],
         )
 
     tree.add_part("hand", part_links("leap_right"), "arm_attachment", HAND_MOUNT_POS, HAND_MOUNT_QUAT, hand_dof)
@@ -169,7 +175,15 @@ def load_robot() -> RobotModel:
     loss = facts["piper"]["joint_armature_damping_frictionloss_published"]
 
     def neck_dof(joint: dict) -> _Dof:
-        return _Dof(tuple(joint["range"]), NECK_KP, NECK_KV, NECK_EFFORT, loss["armature"], loss["damping"], loss["frictionloss"])
+        return _Dof(
+            tuple(joint["range"]),
+            NECK_KP,
+            NECK_KV,
+            NECK_EFFORT,
+            loss["armature"],
+            loss["damping"],
+            loss["frictionloss"],
+        )
 
     neck = tuple(_with_camera(link) for link in part_links("piper"))
     tree.add_part("neck", neck, "base", NECK_MOUNT, identity, neck_dof)
