@@ -13,8 +13,8 @@ from wbm.sim.simulation import Simulation, env_ids
 class MjBatchSimulation(Simulation):
     """Torch tensors that share memory with the arrays which mjbatch binds.
 
-    State is float64 inside; the float32 tensors are copied in only where an element changed, so untouched state keeps
-    its full precision between steps.
+    State is float64 inside; the float32 state tensors are copied in only where an element changed, so untouched state
+    keeps its full precision between steps. Model fields keep MuJoCo's own types, because `set_const` writes those.
     """
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int) -> None:
@@ -28,12 +28,14 @@ class MjBatchSimulation(Simulation):
 
     def field(self, name: str) -> torch.Tensor:
         if name not in self._fields:
-            self._fields[name] = self._share(self._batch.expand, name, getattr(self.model, name, None))
+            self._require(self.model, name)
+            self._fields[name] = torch.from_numpy(self._batch.expand(name))
         return self._fields[name]
 
     def state(self, name: str) -> torch.Tensor:
         if name not in self._states:
-            self._states[name] = self._share(self._batch.bind, name, getattr(mujoco.MjData(self.model), name, None))
+            is_real = np.asarray(self._require(mujoco.MjData(self.model), name)).dtype == np.float64
+            self._states[name] = torch.from_numpy(self._batch.bind(name, np.float32 if is_real else None))
         return self._states[name]
 
     def step(self, count: int = 1) -> None:
@@ -48,11 +50,9 @@ class MjBatchSimulation(Simulation):
     def set_const(self, ids: torch.Tensor) -> None:
         self._batch.set_const(env_ids(ids))
 
-    def _share(self, bind, name: str, like) -> torch.Tensor:
-        if like is None:
-            raise ValueError(f"MuJoCo {mujoco.__version__} has no field {name!r}")
-        array = np.asarray(like)
-        try:
-            return torch.from_numpy(bind(name, np.float32 if array.dtype == np.float64 else None))
-        except (TypeError, ValueError, KeyError) as error:
-            raise ValueError(f"mjbatch cannot vary the field {name!r} per environment: {error}") from error
+    @staticmethod
+    def _require(owner, name: str):
+        value = getattr(owner, name, None)
+        if not isinstance(value, np.ndarray):
+            raise ValueError(f"{type(owner).__name__} has no array field {name!r}")
+        return value
