@@ -48,12 +48,11 @@ def compare(om, sensor, scene, rng, camera: bool):
         sensor.render([2])
         if sensor.ok.numpy()[2] == 0:
             continue
-        t = sensor.tracer
-        R_WS = quat_mat(t.quat.numpy()[2].astype(float))
-        rays_s = t.table.rays[t.pattern.numpy()[2]]
-        dist, geom = om.rays(t.pos.numpy()[2].astype(float), rays_s @ R_WS.T)
+        R_WS = quat_mat(sensor.true_quat.numpy()[2].astype(float))
+        rays_s = sensor.table.rays[sensor.pattern.numpy()[2]]
+        dist, geom = om.rays(sensor.true_pos.numpy()[2].astype(float), rays_s @ R_WS.T)
         measured = dist * rays_s[:, 2] if camera else dist
-        want = (dist >= 0) & (measured >= t.min_range) & (measured <= t.max_range)
+        want = (dist >= 0) & (measured >= sensor.min_range) & (measured <= sensor.max_range)
         valid, got = sensor.valid.numpy()[2], sensor.range.numpy()[2]
         assert (want != valid).sum() <= 1
         both = want & valid

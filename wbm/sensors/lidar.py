@@ -2,18 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 import numpy as np
-import warp as wp
 
-from wbm.kernels.rays_scan import spin_sensor
+from wbm.kernels.noise import RayNoise
+from wbm.sensors.ray_sensor import ExtrinsicNoise, RaySensor
 from wbm.sensors.scene import RayScene
-from wbm.sensors.tracer import RayTracer
 
 MAX_PATTERNS = 64
+SEED_SALT = 0x4C32
+
+
+@dataclass(frozen=True)
+class LidarNoise:
+    """Errors of a time-of-flight scanner; a zero switches a term off.
+
+    The range error is normal with a constant deviation (the maker's accuracy of 20 mm is taken as two deviations). The
+    chance of losing a return is `drop + drop_far (r / max_range)^2`: the echo's power falls with the square of the
+    range. Sparsity loses whole arcs of a sweep, as lost packets do.
+
+    Attributes:
+        sigma: range deviation, m.
+        drop, drop_far: chances.
+        sparsity: chance of losing an arc.
+        arc: consecutive rays in an arc.
+    """
+
+    sigma: float = 0.01
+    drop: float = 0.01
+    drop_far: float = 0.2
+    sparsity: float = 0.05
+    arc: int = 16
+
+    def __post_init__(self) -> None:
+        if self.sigma < 0 or self.arc < 1:
+            raise ValueError("LiDAR noise: need sigma >= 0 and arc >= 1")
+        if not all(0 <= p <= 1 for p in (self.drop, self.drop_far, self.sparsity)):
+            raise ValueError("LiDAR noise: drop, drop_far and sparsity are chances in [0, 1]")
 
 
 @dataclass(frozen=True)
@@ -28,6 +55,8 @@ class LidarConfig:
             side, so that the vertical field of view is 90 - min_elevation_deg = 96 degrees.
         min_range, max_range: m.
         bundle: rays in a culling bundle.
+        noise: error model; None is exact.
+        extrinsic: mounting error.
     """
 
     num_rays: int = 1024
@@ -38,10 +67,12 @@ class LidarConfig:
     min_range: float = 0.05
     max_range: float = 30.0
     bundle: int = 64
+    noise: LidarNoise | None = None
+    extrinsic: ExtrinsicNoise = field(default_factory=ExtrinsicNoise)
 
     def __post_init__(self) -> None:
-        if self.num_rays < 1:
-            raise ValueError(f"LiDAR: num_rays must be >= 1, got {self.num_rays}")
+        if self.num_rays < 1 or self.bundle < 1:
+            raise ValueError(f"LiDAR: num_rays and bundle must be >= 1, got {self.num_rays}, {self.bundle}")
         if min(self.step_hz, self.sweep_hz, self.spin_hz) <= 0:
             raise ValueError("LiDAR: step_hz, sweep_hz and spin_hz must be positive")
         if not -90 <= self.min_elevation_deg < 90:
@@ -56,7 +87,7 @@ def scan_rays(config: LidarConfig) -> np.ndarray:
     At time t since the step began, with the sweep's phase `f` at that moment:
     `alpha = a0 + (pi - 2 a0) frac(f + sweep_hz t)`, `theta = 2 pi spin_hz t`,
     `d = R_z(theta) (cos alpha, 0, sin alpha)`. The head's angle at the step's start turns the whole pattern and is left
-    to `spin_sensor`. Q is the period of `sweep_hz / step_hz` modulo 1 as a fraction (25 for 216 / 25).
+    to `aim_sensors`. Q is the period of `sweep_hz / step_hz` modulo 1 as a fraction (25 for 216 / 25).
     """
     ratio = sweep_ratio(config)
     time = (np.arange(config.num_rays) + 0.5) / (config.num_rays * config.step_hz)
@@ -72,38 +103,30 @@ def sweep_ratio(config: LidarConfig) -> Fraction:
     return Fraction(config.sweep_hz / config.step_hz).limit_denominator(MAX_PATTERNS)
 
 
-class Lidar:
-    """Scans of all or some environments of a `RayScene`, rolling with each environment's step.
+class Lidar(RaySensor):
+    """Scans of a `RayScene` in time order, rolling with each environment's `step`.
 
-    Live inputs: `pos` [N] vec3 and `quat` [N] vec4 (w x y z) of the LiDAR frame in the world, `step` [N] int32, the
-    policy step of each environment's episode. Outputs in time order along R = num_rays: see `RayTracer`; `point_s` is
-    in the LiDAR frame L, which does not turn with the head.
+    The sensor frame is L, which does not turn with the head; z up.
     """
 
-    def __init__(self, config: LidarConfig, scene: RayScene, exclude_body: int = -1) -> None:
-        """`exclude_body` is the body that carries the LiDAR; its instances are not seen."""
-        self.config, self.scene = config, scene
-        n = scene.num_envs
-        self.tracer = RayTracer(
-            scene, scan_rays(config), config.min_range, config.max_range, exclude_body, config.bundle, spinning=True
+    def __init__(self, config: LidarConfig, scene: RayScene, exclude_body: int = -1, seed: int = 0) -> None:
+        """`exclude_body` is the body that carries the LiDAR."""
+        self.config = config
+        noise = RayNoise()
+        if config.noise is not None:
+            noise.active = 1
+            noise.sigma, noise.drop, noise.drop_far = config.noise.sigma, config.noise.drop, config.noise.drop_far
+            noise.burst, noise.burst_len = config.noise.sparsity, config.noise.arc
+        super().__init__(
+            scene,
+            scan_rays(config),
+            config.min_range,
+            config.max_range,
+            turn=config.spin_hz / config.step_hz,
+            exclude_body=exclude_body,
+            bundle=config.bundle,
+            noise=noise,
+            extrinsic=config.extrinsic,
+            # Keeps the draws apart from those of a camera with the same seed.
+            seed=seed ^ SEED_SALT,
         )
-        self.pos, self.quat = wp.zeros(n, dtype=wp.vec3, device=scene.device), self.tracer.frame_quat
-        self.step = wp.zeros(n, dtype=wp.int32, device=scene.device)
-        self._turn = float(Fraction(config.spin_hz / config.step_hz).limit_denominator(10**6))
-        for name in ("range", "instance", "id", "color", "valid", "ok", "point_s", "point_w"):
-            setattr(self, name, getattr(self.tracer, name))
-
-    def render(self, env_ids: Sequence[int] | np.ndarray | wp.array | None = None) -> None:
-        """Scan the given environments (all for None) at their live poses and steps into the output arrays."""
-        tracer, ids = self.tracer, self.tracer.env_index(env_ids)
-        if ids.shape[0] == 0:
-            return
-        wp.launch(
-            spin_sensor,
-            dim=ids.shape[0],
-            inputs=[ids, self.step, self._turn, sweep_ratio(self.config).denominator, self.pos, self.quat],
-            outputs=[tracer.pattern, tracer.pos, tracer.quat],
-            device=self.scene.device,
-        )
-        tracer.trace(ids)
-        tracer.fill(ids)
