@@ -22,7 +22,7 @@ ROOTS = ("wbm", "stages")
 TRANSPARENT = {
     "stages.cli", "stages.commands", "stages.code", "stages.commands_artifacts", "stages.compose", "stages.config",
     "stages.convert",
-    "stages.pipeline", "stages.plan", "stages.progress", "stages.provenance", "stages.registry", "stages.tables",
+    "stages.pipeline", "stages.plan", "stages.progress", "stages.provenance", "stages.registry", "stages.tables", "stages.completion", "stages.doctor", "stages.submit",
     "wbm.artifacts.backend", "wbm.artifacts.config",
     "wbm.artifacts.errors", "wbm.artifacts.lease", "wbm.artifacts.manifest", "wbm.artifacts.migrate",
     "wbm.artifacts.remote", "wbm.artifacts.store",
@@ -125,7 +125,7 @@ def _parse(source: bytes, package: str) -> _Module:
         elif isinstance(node, ast.ImportFrom):
             parent = ".".join(package.split(".")[: len(package.split(".")) - node.level + 1]) if node.level else ""
             stem = ".".join(part for part in (parent, node.module) if part)
-            imports += [f"{stem}.{alias.name}" if stem.split(".")[0] in ROOTS else stem for alias in node.names]
+            imports += [f"{stem}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             if _MODULE_STRING.fullmatch(node.value):
                 imports.append(node.value.replace(":", "."))
