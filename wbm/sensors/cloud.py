@@ -49,7 +49,7 @@ class PointCloud:
     was measured; points stay in that frame however late they are delivered.
 
     Outputs [N,P]: `xyz` [vec3], base frame, m; `rgb` [vec3] in 0..1; `valid`, `target`, `robot` [bool]; `id` [int32].
-    Where a scan has too few points the last places are zeros with `valid` False. `age` [N] int32 is the latency in steps.
+    Where a scan has too few points the last places are zeros with `valid` False. `age` [N] int32: the latency, steps.
     """
 
     def __init__(self, config: CloudConfig, sensor: RaySensor, target_id: int = Semantic.TARGET, seed: int = 0) -> None:
@@ -91,9 +91,9 @@ class PointCloud:
             assemble_cloud,
             dim=ids.shape[0],
             inputs=[
-                ids, s.step, s.key, self.seed, self.base_pos, self.base_quat, wp.vec3(*c.crop_min), wp.vec3(*c.crop_max),
-                self.target_id, int(Semantic.ROBOT), c.self_filter, int(c.target_share * c.num_points), s.valid, s.id,
-                s.color, s.point_w, self._class,
+                ids, s.step, s.key, self.seed, self.base_pos, self.base_quat, wp.vec3(*c.crop_min),
+                wp.vec3(*c.crop_max), self.target_id, int(Semantic.ROBOT), c.self_filter,
+                int(c.target_share * c.num_points), s.valid, s.id, s.color, s.point_w, self._class,
             ],
             outputs=[self._newest[name] for name in FIELDS],
             device=s.scene.device,

@@ -63,7 +63,7 @@ class FrameDelay:
         self.out = {name: wp.zeros_like(array) for name, array in self._frame.items()}
         self._views = []
         for name, array in self._frame.items():
-            width = array.capacity // n if n else 0
+            width = array.strides[0] if n else 0
             ring = wp.zeros((n, self._ring_size, width), dtype=wp.uint8, device=device)
             self._views.append((_bytes(array, n, width), ring, _bytes(self.out[name], n, width)))
 
@@ -87,7 +87,8 @@ class FrameDelay:
             plan_delivery,
             dim=env_ids.shape[0],
             inputs=[
-                env_ids, self.key, self.seed, c.delay_min, c.delay_max, c.lost, self._ring_size, self._count, self._last,
+                env_ids, self.key, self.seed, c.delay_min, c.delay_max, c.lost, self._ring_size, self._count,
+                self._last,
             ],
             outputs=[self._write, self._read, self.age],
             device=device,
