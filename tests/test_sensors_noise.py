@@ -8,11 +8,19 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wbm.sensors.cloud import CloudConfig, PointCloud
-from wbm.sensors.delay import DelayConfig, FrameDelay
-from wbm.sensors.depth import DepthCamera, DepthConfig, DepthNoise
-from wbm.sensors.lidar import Lidar, LidarConfig, LidarNoise
-from wbm.sensors.ray_sensor import ExtrinsicNoise
+from wbm.sensors.cloud import PointCloud
+from wbm.sensors.config import (
+    CloudConfig,
+    DelayConfig,
+    DepthConfig,
+    DepthNoise,
+    ExtrinsicNoise,
+    LidarConfig,
+    LidarNoise,
+)
+from wbm.sensors.delay import FrameDelay
+from wbm.sensors.depth import DepthCamera
+from wbm.sensors.lidar import Lidar
 from wbm.sensors.scene import BOX, Instances, RayScene, Semantic
 
 QUIET_DEPTH = {"subpixel": 0.0, "drop": 0.0, "edge": 0.0}

@@ -2,44 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import warp as wp
 
 from wbm.kernels.points import assemble_cloud
-from wbm.sensors.delay import DelayConfig, FrameDelay
+from wbm.sensors.config import CloudConfig
+from wbm.sensors.delay import FrameDelay
 from wbm.sensors.ray_sensor import EnvIds, RaySensor
 from wbm.sensors.scene import Semantic
 
 FIELDS = ("xyz", "rgb", "valid", "target", "robot", "id")
-
-
-@dataclass(frozen=True)
-class CloudConfig:
-    """How a scan becomes a cloud.
-
-    Attributes:
-        num_points: P.
-        target_share: share of the P points that may lie on the target while others can fill the rest.
-        crop_min, crop_max: corners of the box of points that are kept, base frame, m.
-        self_filter: whether points on the robot are left out.
-        delay: latency of the cloud.
-    """
-
-    num_points: int = 256
-    target_share: float = 0.4
-    crop_min: tuple[float, float, float] = (-3.0, -3.0, -0.1)
-    crop_max: tuple[float, float, float] = (3.0, 3.0, 2.5)
-    self_filter: bool = False
-    delay: DelayConfig = field(default_factory=DelayConfig)
-
-    def __post_init__(self) -> None:
-        if self.num_points < 1:
-            raise ValueError(f"cloud: num_points must be >= 1, got {self.num_points}")
-        if not 0 <= self.target_share <= 1:
-            raise ValueError("cloud: target_share must lie in [0, 1]")
-        if any(lo >= hi for lo, hi in zip(self.crop_min, self.crop_max, strict=True)):
-            raise ValueError("cloud: crop_min must lie below crop_max")
 
 
 class PointCloud:

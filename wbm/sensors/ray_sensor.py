@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -12,26 +11,10 @@ from wbm.kernels.noise import RayNoise, aim_sensors
 from wbm.kernels.points import fill_hits
 from wbm.kernels.rays import cull_bundles, place_instances, trace_rays
 from wbm.sensors.bundles import BUNDLE, RayTable, build_table
+from wbm.sensors.config import ExtrinsicNoise
 from wbm.sensors.scene import RayScene
 
 EnvIds = Sequence[int] | np.ndarray | wp.array | None
-
-
-@dataclass(frozen=True)
-class ExtrinsicNoise:
-    """Mounting error, drawn once an episode: the rays leave the pose `X_WS exp(xi)`, the points are placed with `X_WS`.
-
-    Attributes:
-        sigma_pos: deviation of each coordinate, m.
-        sigma_rot: deviation of each component of the rotation vector, rad.
-    """
-
-    sigma_pos: float = 0.0
-    sigma_rot: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.sigma_pos < 0 or self.sigma_rot < 0:
-            raise ValueError("extrinsic noise: sigma_pos and sigma_rot must be >= 0")
 
 
 class RaySensor:
