@@ -227,4 +227,6 @@ class SensorsConfig:
     depth: DepthConfig = field(default_factory=DepthConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
     depth_cloud: CloudConfig = field(default_factory=CloudConfig)
-    lidar_cloud: CloudConfig = field(default_factory=lambda: CloudConfig(crop_min=(-6, -6, -0.1), crop_max=(6, 6, 2.5)))
+    lidar_cloud: CloudConfig = field(
+        default_factory=lambda: CloudConfig(crop_min=(-6.0, -6.0, -0.1), crop_max=(6.0, 6.0, 2.5))
+    )
