@@ -40,6 +40,7 @@ class SafetyFilter:
         """Forget the past; the next reading starts a new episode."""
         self._last: Reading | None = None
         self._origin: np.ndarray | None = None
+        self._low, self._high = self.contract.q_min.copy(), self.contract.q_max.copy()
         self._q_cmd: np.ndarray | None = None
         self._v_cmd = np.zeros(len(self._names))
 
@@ -61,7 +62,10 @@ class SafetyFilter:
         self._check_clouds(reading)
         if self._origin is None:
             self._origin = np.array(reading.q[:2], dtype=np.float64)
-            self._q_cmd = np.clip(np.asarray(reading.q, dtype=np.float64), self.contract.q_min, self.contract.q_max)
+            half = self.contract.data["workspace"]["base_box_m"]  # the base brakes at the box's wall as at a joint limit
+            self._low[:2] = np.maximum(self._low[:2], self._origin - half)
+            self._high[:2] = np.minimum(self._high[:2], self._origin + half)
+            self._q_cmd = np.clip(np.asarray(reading.q, dtype=np.float64), self._low, self._high)
         self._last = reading
 
     def _check_form(self, reading: Reading) -> None:
@@ -122,7 +126,7 @@ class SafetyFilter:
             self._check_motion(reading, q, qd)
         half = c.data["workspace"]["base_box_m"]
         origin = q[:2] if self._origin is None else self._origin
-        if (np.abs(q[:2] - origin) > half).any():
+        if (np.abs(q[:2] - origin) > half + tol["limit"]).any():
             raise Refused(Fault.WORKSPACE, f"the base is {np.abs(q[:2] - origin).max():.2f} m from its start, allowed {half:.2f} m")
 
     def _check_motion(self, reading: Reading, q: np.ndarray, qd: np.ndarray) -> None:
@@ -173,11 +177,11 @@ class SafetyFilter:
             raise Refused(Fault.POLICY_OUTPUT, "the joint target holds values that are not finite")
         c, dt, q = self.contract, self._dt, self._q_cmd
         step = c.qdd_max * dt
-        upper = np.minimum(np.minimum(c.qd_max, self._v_cmd + step), brake_velocity(c.q_max - q, c.qdd_max, dt))
-        lower = np.maximum(np.maximum(-c.qd_max, self._v_cmd - step), -brake_velocity(q - c.q_min, c.qdd_max, dt))
+        upper = np.minimum(np.minimum(c.qd_max, self._v_cmd + step), brake_velocity(self._high - q, c.qdd_max, dt))
+        lower = np.maximum(np.maximum(-c.qd_max, self._v_cmd - step), -brake_velocity(q - self._low, c.qdd_max, dt))
         velocity = np.clip((q_target - q) / dt, lower, upper)
         # Rounding may leave the last bit outside; the clip moves the target by less than 1e-15.
-        target = np.clip(q + velocity * dt, c.q_min, c.q_max)
+        target = np.clip(q + velocity * dt, self._low, self._high)
         self._q_cmd, self._v_cmd = target, velocity
         return target, velocity
 
@@ -185,7 +189,7 @@ class SafetyFilter:
         """The robot was told to hold: start again from where it is, at rest."""
         self._v_cmd = np.zeros(len(self._names))
         if self._last is not None:
-            self._q_cmd = np.clip(np.asarray(self._last.q, dtype=np.float64), self.contract.q_min, self.contract.q_max)
+            self._q_cmd = np.clip(np.asarray(self._last.q, dtype=np.float64), self._low, self._high)
 
 
 def brake_velocity(distance: np.ndarray, acceleration: np.ndarray, dt: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any
 
 import jinja2
 
-from wbm.report.plots import curves_figure, failure_figure, figure4, to_svg
+from wbm.report.plots import curves_figure, failure_figure, figure4_panels, to_svg
 from wbm.report.stats import ARM_LABELS, PAPER_SUCCESS, overlap
 from wbm.report.video import KEY_PHASES, data_uri
 
@@ -140,8 +140,10 @@ def _figure4_item(item: dict[str, Any]) -> dict[str, Any]:
         {"target_visible": None, **a, "label": a.get("label", ARM_LABELS.get(a["key"], a["key"])), "paper": PAPER_SUCCESS.get(a["key"])}
         for a in item["arms"]
     ]
-    svg = to_svg(figure4(arms), f"Figure 4, {item.get('name', 'ablations')}")
-    return {"name": item.get("name", ""), "note": item.get("note", ""), "arms": arms, "svg": svg, "verdict": _verdict(item.get("name", ""), arms)}
+    name = item.get("name", "")
+    panels = zip(("reward", "success"), figure4_panels(arms), strict=True)
+    svgs = [to_svg(figure, f"Figure 4 {name} {what}") for what, figure in panels if figure is not None]
+    return {"name": name, "note": item.get("note", ""), "arms": arms, "svgs": svgs, "verdict": _verdict(name, arms)}
 
 
 def _verdict(name: str, arms: Sequence[dict[str, Any]]) -> list[str]:

@@ -139,7 +139,7 @@ def draw_success(ax: Axes, arms: Sequence[dict[str, Any]]) -> None:
 
 
 def figure4(arms: Sequence[dict[str, Any]], title: str = "") -> Figure:
-    """The paper's Figure 4: (a) training reward with bands, (b) lifting success with intervals.
+    """The paper's Figure 4 in one picture: (a) training reward with bands, (b) lifting success with intervals.
 
     Args:
         arms: dictionaries with `key`, `success_rate`, `success_ci95`, and `curve` (`steps`, `values` [seeds][steps]).
@@ -147,7 +147,7 @@ def figure4(arms: Sequence[dict[str, Any]], title: str = "") -> Figure:
     """
     with matplotlib.rc_context(_STYLE):
         figure, (left, right) = _figure(9.6, 3.7, 2, width_ratios=(1.35, 1))
-        draw_curves(left, {a["key"]: a["curve"] for a in arms if a.get("curve")}, ARM_COLOURS, "environment steps", "reward")
+        draw_curves(left, _arm_curves(arms), ARM_COLOURS, "environment steps", "reward")
         left.set_title("(a) Training reward")
         draw_success(right, arms)
         right.set_title("(b) Lifting success")
@@ -156,10 +156,28 @@ def figure4(arms: Sequence[dict[str, Any]], title: str = "") -> Figure:
     return figure
 
 
+def figure4_panels(arms: Sequence[dict[str, Any]]) -> tuple[Figure | None, Figure]:
+    """The two panels of `figure4` as figures of their own, for pages that stack them; the first is None without curves."""
+    with matplotlib.rc_context(_STYLE):
+        left = None
+        if curves := _arm_curves(arms):
+            left, ax = _figure(4.9, 3.4)
+            draw_curves(ax, curves, ARM_COLOURS, "environment steps", "reward")
+            ax.set_title("(a) Training reward")
+        right, ax = _figure(4.1, 3.4)
+        draw_success(ax, arms)
+        ax.set_title("(b) Lifting success")
+    return left, right
+
+
+def _arm_curves(arms: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {a["key"]: a["curve"] for a in arms if a.get("curve")}
+
+
 def curves_figure(curves: dict[str, dict[str, Any]], ylabel: str) -> Figure:
     """Training curves of one quantity."""
     with matplotlib.rc_context(_STYLE):
-        figure, ax = _figure(6.4, 3.2)
+        figure, ax = _figure(4.9, 3.0)
         draw_curves(ax, curves, ARM_COLOURS, "steps", ylabel)
     return figure
 
@@ -167,7 +185,7 @@ def curves_figure(curves: dict[str, dict[str, Any]], ylabel: str) -> Figure:
 def failure_figure(failures: dict[str, int], episodes: int) -> Figure:
     """Horizontal bars of failures by reason, as a share of all episodes."""
     with matplotlib.rc_context(_STYLE):
-        figure, ax = _figure(6.4, 0.55 + 0.42 * max(1, len(failures)))
+        figure, ax = _figure(4.6, 0.55 + 0.38 * max(1, len(failures)))
         names = list(failures)[::-1]
         values = [100 * failures[n] / max(1, episodes) for n in names]
         ax.barh(range(len(names)), values, height=0.6, color=FAILURE_COLOUR, alpha=0.9)

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from wbm.deploy.kinematics import mat_to_quat
+
 RenderRgb = Callable[..., np.ndarray]
 """`render_rgb(scene, env, pos, quat, width, height, fov_deg)`: uint8 [height, width, 3] from a camera at `pos` (W, m)
 with optical orientation `quat` (w x y z; x right, y down, z forward)."""
@@ -57,24 +59,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     z /= np.linalg.norm(z)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(x) < 1e-6 else x / np.linalg.norm(x)
-    return _mat_to_quat(np.stack([x, np.cross(z, x), z], axis=1))
-
-
-def _mat_to_quat(rot: np.ndarray) -> np.ndarray:
-    """Unit quaternion (w x y z) of a rotation matrix, by its largest component (Shepperd 1978)."""
-    t = np.trace(rot)
-    squares = np.array([t, rot[0, 0], rot[1, 1], rot[2, 2]])
-    i = int(np.argmax(squares))
-    if i == 0:
-        quat = np.array([1 + t, rot[2, 1] - rot[1, 2], rot[0, 2] - rot[2, 0], rot[1, 0] - rot[0, 1]])
-    else:
-        a, b, c = [(0, 1, 2), (1, 2, 0), (2, 0, 1)][i - 1]
-        quat = np.zeros(4)
-        quat[0] = rot[c, b] - rot[b, c]
-        quat[1 + a] = 1 + rot[a, a] - rot[b, b] - rot[c, c]
-        quat[1 + b] = rot[b, a] + rot[a, b]
-        quat[1 + c] = rot[c, a] + rot[a, c]
-    return quat / np.linalg.norm(quat)
+    return mat_to_quat(np.stack([x, np.cross(z, x), z], axis=1))
 
 
 def follow_camera(base_pos: np.ndarray, target_pos: np.ndarray, distance: float = 2.1, height: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
