@@ -56,7 +56,9 @@ def make_result(folder: Path, episodes: int = 60, films: int = 4, seed: int = 0)
     for k, phase in enumerate(KEY_PHASES):
         for kind, size in (("outer", (240, 180)), ("camera", (160, 120))):
             (folder / f"{phase}_{kind}.jpg").write_bytes(jpeg_bytes(picture(*size, k / 4)))
-        first["filmstrip"].append({"phase": phase, "outer": f"{phase}_outer.jpg", "camera": f"{phase}_camera.jpg", "time_s": 2.0 * k})
+        first["filmstrip"].append(
+            {"phase": phase, "outer": f"{phase}_outer.jpg", "camera": f"{phase}_camera.jpg", "time_s": 2.0 * k}
+        )
     steps = np.linspace(0, 1e6, 40)
     arms = []
     for key, top, wins in (("full", 9.5, 97), ("no_active_vision", 7.0, 79), ("joint_space", 2.0, 18)):
@@ -66,11 +68,24 @@ def make_result(folder: Path, episodes: int = 60, films: int = 4, seed: int = 0)
     return {
         **summarise(records),
         "records": records,
-        "figure4": [{"name": "RL stage", "note": "Reward: mean over 3 seeds, band from the smallest to the largest.", "arms": arms}],
+        "figure4": [
+            {
+                "name": "RL stage",
+                "note": "Reward: mean over 3 seeds, band from the smallest to the largest.",
+                "arms": arms,
+            }
+        ],
         "curves": {
             "teacher reward": {"top_down": arms[0]["curve"], "side": arms[1]["curve"]},
-            "student loss": {"student": {"steps": steps.tolist(), "values": [(0.3 * np.exp(-steps / 2e5) + 0.02).tolist()]}},
+            "student loss": {
+                "student": {"steps": steps.tolist(), "values": [(0.3 * np.exp(-steps / 2e5) + 0.02).tolist()]}
+            },
         },
         "config": {"evaluation": {"episodes": episodes, "split": "test", "seed": seed}},
-        "provenance": {"policy": "student/laptop/0123456789ab", "commit": "abcdef0", "machine": "2 cores", "seed": seed},
+        "provenance": {
+            "policy": "student/laptop/0123456789ab",
+            "commit": "abcdef0",
+            "machine": "2 cores",
+            "seed": seed,
+        },
     }

@@ -35,7 +35,11 @@ def resealed(members: dict[str, bytes], sums: bool = True) -> bytes:
     members = dict(members)
     if sums:
         members["checksums.json"] = json.dumps(
-            {k: hashlib.sha256(v).hexdigest() for k, v in members.items() if k not in ("checksums.json", "signature.json")}
+            {
+                k: hashlib.sha256(v).hexdigest()
+                for k, v in members.items()
+                if k not in ("checksums.json", "signature.json")
+            }
         ).encode()
     return pack(members)
 
@@ -84,7 +88,9 @@ def test_golden_vectors_guard_the_export(tmp_path):
 @given(data=st.data())
 def test_a_flipped_bit_anywhere_is_refused(bundle_path, tmp_path_factory, data):
     raw = bytearray(bundle_path.read_bytes())
-    index = data.draw(st.one_of(st.integers(0, len(raw) - 1), st.integers(0, 60), st.integers(len(raw) - 200, len(raw) - 1)))
+    index = data.draw(
+        st.one_of(st.integers(0, len(raw) - 1), st.integers(0, 60), st.integers(len(raw) - 200, len(raw) - 1))
+    )
     raw[index] ^= 1 << data.draw(st.integers(0, 7))
     fault = refused(tmp_path_factory.getbasetemp() / "flipped.wbm", bytes(raw))
     assert fault in {Fault.CHECKSUM, Fault.TRUNCATED, Fault.BUNDLE_VERSION, Fault.NOT_A_BUNDLE}
@@ -203,7 +209,9 @@ def test_signature(tmp_path):
     from cryptography.hazmat.primitives import serialization
 
     keys = [ed25519.Ed25519PrivateKey.generate() for _ in range(2)]
-    pem = keys[0].private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    pem = keys[0].private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
     (tmp_path / "key.pem").write_bytes(pem)
     raw = [k.public_key().public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw) for k in keys]
     path = make_bundle(tmp_path / "signed.wbm", sign_key=tmp_path / "key.pem")

@@ -146,9 +146,13 @@ def inject(kind, reading, contract, rng):
         return _fresh(reading, stamps=stamps), {Fault.STALE}
     if kind == "future":
         sensor = ("joints", "depth", "lidar")[rng.integers(3)]
-        return _fresh(reading, stamps=reading.stamps | {sensor: reading.stamps[sensor] + rng.uniform(0.2, 100)}), {Fault.FUTURE_STAMP}
+        return _fresh(reading, stamps=reading.stamps | {sensor: reading.stamps[sensor] + rng.uniform(0.2, 100)}), {
+            Fault.FUTURE_STAMP
+        }
     if kind == "repeated":
-        return _fresh(reading, stamps=reading.stamps | {"joints": reading.stamps["joints"] - 0.04}), {Fault.NOT_ADVANCING}
+        return _fresh(reading, stamps=reading.stamps | {"joints": reading.stamps["joints"] - 0.04}), {
+            Fault.NOT_ADVANCING
+        }
     if kind == "dropped":
         name = (*ARRAYS, "stamps", "joint_names")[rng.integers(10)]
         return _fresh(reading, **{name: None}), {Fault.DROPPED}
@@ -293,7 +297,9 @@ def test_the_loop_stops_after_many_refusals(bundle):
 
 
 @pytest.mark.parametrize(
-    "change", [{"joint_names": ("x",) * 32}, {"units": {"angle": "deg"}}, {"camera_frame": "base"}, {"rate_hz": 100.0}], ids=str
+    "change",
+    [{"joint_names": ("x",) * 32}, {"units": {"angle": "deg"}}, {"camera_frame": "base"}, {"rate_hz": 100.0}],
+    ids=str,
 )
 def test_drivers_must_agree_with_the_contract(bundle, change):
     driver = FakeRobot()
@@ -342,7 +348,11 @@ def test_imports_nothing_but_numpy_and_onnxruntime(bundle):
     )
     root = Path(__file__).resolve().parent.parent
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)}, timeout=120
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr
     assert np.isfinite(float(done.stdout))

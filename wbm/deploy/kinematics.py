@@ -26,9 +26,23 @@ class Kinematics:
             axis = np.array(link["axis"])
             skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
             self._links.append(
-                (i, link["parent"], np.array(link["pos"]), quat_to_mat(np, np.array(link["quat"])), link["type"], axis, skew, skew @ skew, link["joint"])
+                (
+                    i,
+                    link["parent"],
+                    np.array(link["pos"]),
+                    quat_to_mat(np, np.array(link["quat"])),
+                    link["type"],
+                    axis,
+                    skew,
+                    skew @ skew,
+                    link["joint"],
+                )
             )
-        self._frames = {n: (f["link"], np.array(f["pos"]), quat_to_mat(np, np.array(f["quat"]))) for n, f in frames.items() if f["link"] in wanted}
+        self._frames = {
+            n: (f["link"], np.array(f["pos"]), quat_to_mat(np, np.array(f["quat"])))
+            for n, f in frames.items()
+            if f["link"] in wanted
+        }
         self._num_links = len(tree)
 
     def frames(self, q: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:

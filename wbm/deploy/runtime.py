@@ -134,4 +134,7 @@ class PolicyRuntime:
                 raise Refused(Fault.WORKSPACE, f"the target puts {name} at height {frames[name][1][2]:.3f} m")
         reach = float(np.linalg.norm((frames["ee"][1] - frames["base"][1])[:2]))
         if reach > limits["reach_m"]:
-            raise Refused(Fault.WORKSPACE, f"the target puts the grasp centre {reach:.2f} m from the base, allowed {limits['reach_m']:.2f} m")
+            raise Refused(
+                Fault.WORKSPACE,
+                f"the target puts the grasp centre {reach:.2f} m from the base, allowed {limits['reach_m']:.2f} m",
+            )

@@ -19,7 +19,11 @@ _OBJECTS_SHOWN = 12
 
 
 def write_page(
-    path: str | Path, result: dict[str, Any], base: str | Path | None = None, title: str = "Whole-body grasping: evaluation", embed_mb: float = 24.0
+    path: str | Path,
+    result: dict[str, Any],
+    base: str | Path | None = None,
+    title: str = "Whole-body grasping: evaluation",
+    embed_mb: float = 24.0,
 ) -> Path:
     """Write the report of an evaluation.
 
@@ -41,13 +45,18 @@ def write_page(
     """
     path = Path(path)
     base = path.parent if base is None else Path(base)
-    records = [{"time_to_grasp_s": None, "reason": "", "instruction": "", "seed": 0, **r} for r in result.get("records", [])]
+    records = [
+        {"time_to_grasp_s": None, "reason": "", "instruction": "", "seed": 0, **r} for r in result.get("records", [])
+    ]
     successes, failed, left_out = _films(records, base, int(embed_mb * 1e6))
     objects = _worst_first(result["by_object"])
     names = list(objects)
     figures = [_figure4_item(item) for item in result.get("figure4", [])]
     strips = [_strip(r, base) for r in records if r.get("filmstrip")]
-    curves = [{"name": name, "svg": to_svg(curves_figure(c, name), f"Curve of {name}")} for name, c in result.get("curves", {}).items()]
+    curves = [
+        {"name": name, "svg": to_svg(curves_figure(c, name), f"Curve of {name}")}
+        for name, c in result.get("curves", {}).items()
+    ]
     failures = result["failures"]
     sections = [
         ("summary", "Summary", True),
@@ -59,7 +68,9 @@ def write_page(
         ("breakdown", "Breakdown", True),
         ("provenance", "Provenance", True),
     ]
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     html = environment.from_string(_TEMPLATE.read_text(encoding="utf-8")).render(
         title=title,
         lead=_lead(result),
@@ -126,7 +137,9 @@ def _films(records: Sequence[dict[str, Any]], base: Path, budget: int) -> tuple[
 
 def _strip(record: dict[str, Any], base: Path) -> dict[str, Any]:
     def image(name: str | None) -> str:
-        return data_uri((base / name).read_bytes(), "image/png" if name.endswith(".png") else "image/jpeg") if name else ""
+        return (
+            data_uri((base / name).read_bytes(), "image/png" if name.endswith(".png") else "image/jpeg") if name else ""
+        )
 
     frames = [
         {"phase": f["phase"], "outer": image(f["outer"]), "camera": image(f.get("camera")), "time_s": f.get("time_s")}
@@ -137,7 +150,12 @@ def _strip(record: dict[str, Any], base: Path) -> dict[str, Any]:
 
 def _figure4_item(item: dict[str, Any]) -> dict[str, Any]:
     arms = [
-        {"target_visible": None, **a, "label": a.get("label", ARM_LABELS.get(a["key"], a["key"])), "paper": PAPER_SUCCESS.get(a["key"])}
+        {
+            "target_visible": None,
+            **a,
+            "label": a.get("label", ARM_LABELS.get(a["key"], a["key"])),
+            "paper": PAPER_SUCCESS.get(a["key"]),
+        }
         for a in item["arms"]
     ]
     name = item.get("name", "")

@@ -57,7 +57,9 @@ def to_svg(figure: Figure, label: str) -> str:
     """Inline SVG that scales to its container; `label` is read out by screen readers. Same figure, same text."""
     buffer = io.StringIO()
     with matplotlib.rc_context(_STYLE):
-        figure.savefig(buffer, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None, "Creator": None})
+        figure.savefig(
+            buffer, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None, "Creator": None}
+        )
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
     for stand_in, variable in _VARIABLES.items():
@@ -125,12 +127,28 @@ def draw_success(ax: Axes, arms: Sequence[dict[str, Any]]) -> None:
         value, (low, high) = 100 * arm["success_rate"], (100 * b for b in arm["success_ci95"])
         colour = ARM_COLOURS.get(arm["key"], SERIES_COLOURS[i % len(SERIES_COLOURS)])
         ax.bar(i, value, width=0.52, color=colour, alpha=0.9)
-        ax.errorbar(i, value, yerr=[[max(0.0, value - low)], [max(0.0, high - value)]], color=_INK, capsize=4, linewidth=1.4)
-        ax.annotate(f"{value:.0f}", (i, high), xytext=(0, 5), textcoords="offset points", ha="center", fontweight="bold")
+        ax.errorbar(
+            i, value, yerr=[[max(0.0, value - low)], [max(0.0, high - value)]], color=_INK, capsize=4, linewidth=1.4
+        )
+        ax.annotate(
+            f"{value:.0f}", (i, high), xytext=(0, 5), textcoords="offset points", ha="center", fontweight="bold"
+        )
         if arm["key"] in PAPER_SUCCESS:
-            ax.plot(i + 0.37, 100 * PAPER_SUCCESS[arm["key"]], "D", markersize=6, markerfacecolor="none", markeredgecolor=_INK, clip_on=False)
+            ax.plot(
+                i + 0.37,
+                100 * PAPER_SUCCESS[arm["key"]],
+                "D",
+                markersize=6,
+                markerfacecolor="none",
+                markeredgecolor=_INK,
+                clip_on=False,
+            )
     ax.plot([], [], "D", markersize=6, markerfacecolor="none", markeredgecolor=_INK, linestyle="none", label="paper")
-    ax.set_xticks(range(len(arms)), [arm.get("label", ARM_LABELS.get(arm["key"], arm["key"])).replace(" ", "\n", 1) for arm in arms], color=_INK)
+    ax.set_xticks(
+        range(len(arms)),
+        [arm.get("label", ARM_LABELS.get(arm["key"], arm["key"])).replace(" ", "\n", 1) for arm in arms],
+        color=_INK,
+    )
     ax.set_ylim(0, 112)
     ax.set_yticks(range(0, 101, 20))
     ax.set_ylabel("lifting success (%)")
@@ -190,7 +208,14 @@ def failure_figure(failures: dict[str, int], episodes: int) -> Figure:
         values = [100 * failures[n] / max(1, episodes) for n in names]
         ax.barh(range(len(names)), values, height=0.6, color=FAILURE_COLOUR, alpha=0.9)
         for i, (name, value) in enumerate(zip(names, values, strict=True)):
-            ax.annotate(f"{failures[name]}", (value, i), xytext=(5, 0), textcoords="offset points", va="center", fontweight="bold")
+            ax.annotate(
+                f"{failures[name]}",
+                (value, i),
+                xytext=(5, 0),
+                textcoords="offset points",
+                va="center",
+                fontweight="bold",
+            )
         ax.set_yticks(range(len(names)), [n.replace("_", " ") for n in names], color=_INK)
         ax.set_xlabel("share of all episodes (%)")
         ax.set_xlim(0, max([1.0, *values]) * 1.12)

@@ -62,7 +62,9 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     return mat_to_quat(np.stack([x, np.cross(z, x), z], axis=1))
 
 
-def follow_camera(base_pos: np.ndarray, target_pos: np.ndarray, distance: float = 2.1, height: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
+def follow_camera(
+    base_pos: np.ndarray, target_pos: np.ndarray, distance: float = 2.1, height: float = 1.5
+) -> tuple[np.ndarray, np.ndarray]:
     """Eye [3] and optical quaternion [4] that show robot and target side by side, from the robot's right.
 
     Args:
