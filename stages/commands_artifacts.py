@@ -184,7 +184,7 @@ def verify(items: Sequence[str], as_json: bool) -> None:
     """Check every byte; exit with 1 when something is wrong."""
     store, names = split(items)
     refs = names or store.names()
-    problems = []
+    problems = [] if names else store.dangling()
     with Progress() as progress:
         for ref in progress.track(refs, "verify"):
             problems += store.verify([ref])

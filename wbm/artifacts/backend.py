@@ -53,6 +53,10 @@ class Backend(Protocol):
         """`kind/name/key12` of every published artifact, sorted."""
         ...
 
+    def strays(self) -> list[str]:
+        """Folders where an artifact should be but that hold no manifest."""
+        ...
+
     def has(self, ref: str) -> bool:
         """Whether an artifact is published."""
         ...
@@ -134,12 +138,15 @@ class LocalBackend:
         paths = base.rglob("*") if base.is_dir() else []
         return sorted(p.relative_to(self._meta).as_posix() for p in paths if p.is_file() and p.name[0] != ".")
 
+    def _all_folders(self) -> list[str]:
+        kinds = [kind for kind in _folders(self.work) if kind.name != "reference"]
+        return sorted(f"{kind.name}/{n.name}/{k.name}" for kind in kinds for n in _folders(kind) for k in _folders(n))
+
     def artifacts(self) -> list[str]:
-        found = []
-        for kind in _folders(self.work):
-            if kind.name != "reference":
-                found += [f"{kind.name}/{n.name}/{k.name}" for n in _folders(kind) for k in _folders(n)]
-        return sorted(ref for ref in found if self.has(ref))
+        return [ref for ref in self._all_folders() if self.has(ref)]
+
+    def strays(self) -> list[str]:
+        return [ref for ref in self._all_folders() if not self.has(ref)]
 
     def has(self, ref: str) -> bool:
         return (self.work / ref / MANIFEST).is_file()

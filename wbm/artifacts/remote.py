@@ -102,6 +102,9 @@ class ObjectBackend:
         paths = (str(m["path"]) for m in self._list("artifacts/"))
         return sorted(p.removeprefix("artifacts/").removesuffix(f"/{MANIFEST}") for p in paths if p.endswith(MANIFEST))
 
+    def strays(self) -> list[str]:
+        return []
+
     def has(self, ref: str) -> bool:
         try:
             obstore.head(self._store, _manifest_path(ref))

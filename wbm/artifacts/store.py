@@ -226,8 +226,11 @@ class Store:
         return target
 
     def verify(self, refs: Iterable[str] | None = None) -> list[str]:
-        """Problems of the named artifacts (default: all): one line for each missing, changed or unlisted file."""
-        problems = []
+        """Problems of the named artifacts: one line for each missing, changed or unlisted file.
+
+        Without names, of all of them, and of references to artifacts that are gone.
+        """
+        problems = [] if refs is not None else self.dangling()
         for ref in self.names() if refs is None else refs:
             try:
                 if ref.startswith("reference/"):
@@ -241,6 +244,18 @@ class Store:
             except (ArtifactError, OSError) as error:
                 problems.append(str(error) if str(error).startswith(ref) else f"{ref}: {error}")
         return problems
+
+    def dangling(self) -> list[str]:
+        """Artifacts without a manifest, and references and pins of artifacts that are gone; a line for each."""
+        problems = [f"{ref}: manifest.json is missing" for ref in self.backend.strays()]
+        known = set(self.names())
+        for path in self.backend.records("refs"):
+            kind, name = path.split("/")[1:3]
+            found = self.backend.read(path)
+            ref = f"{kind}/{name}/{json.loads(found[0])['key'][:KEY_LENGTH]}" if found else ""
+            if found and ref not in known:
+                problems.append(f"{path}: points to {ref}, which is gone")
+        return problems + [f"pins/{ref}: the pinned artifact is gone" for ref in self.pins() if ref not in known]
 
     def pin(self, text: str, *, remove: bool = False) -> str:
         """Keep an artifact, and what it was made from, out of `gc`'s reach; or stop doing so. Returns its full name."""
