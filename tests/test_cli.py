@@ -31,9 +31,9 @@ def start(*arguments, **env):
 def wbm(*arguments, **env):
     """Run a command in this process: exit code, standard output, standard error."""
     out, err = io.StringIO(), io.StringIO()
-    with mock.patch.dict(os.environ, env), redirect_stdout(out), redirect_stderr(err):
-        with pytest.raises(SystemExit) as stop:
-            main(list(arguments))
+    redirected = redirect_stdout(out), redirect_stderr(err)
+    with mock.patch.dict(os.environ, env), redirected[0], redirected[1], pytest.raises(SystemExit) as stop:
+        main(list(arguments))
     return stop.value.code, out.getvalue(), err.getvalue()
 
 
@@ -69,12 +69,16 @@ def test_run_skips_what_is_up_to_date_and_plan_says_why(root):
 
 def test_a_setting_reruns_only_the_stages_that_read_it(root):
     states(root)
-    assert states(root, "teachers=[side]") == {"prepare-assets": "up to date", "distill": "ran", "evaluate": "up to date"}
+    assert states(root, "teachers=[side]") == {
+        "prepare-assets": "up to date",
+        "distill": "ran",
+        "evaluate": "up to date",
+    }
     assert set(states(root, "note=again").values()) == {"up to date"}
 
 
 def test_a_stage_that_reran_to_the_same_bytes_stops_the_chain(root):
-    """distill gives the same bytes under another seed, so evaluate is run for its own seed but not because of distill."""
+    """distill gives the same bytes under another seed: evaluate runs for its own seed, not because of distill."""
     states(root)
     assert states(root, "seed=1", "--until", "distill") == {"prepare-assets": "ran", "distill": "ran"}
     _, out, _ = wbm("plan", "--json", root, "seed=1")
@@ -253,7 +257,8 @@ def test_why_diff_and_repro_diff(root):
 
 def test_help_imports_nothing_heavy():
     code = "import sys; from stages.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
-    code += "print([m for m in ('torch','warp','mujoco','hydra','zarr','numpy','rich') if m in sys.modules], file=sys.stderr)"
+    code += "heavy = ('torch', 'warp', 'mujoco', 'hydra', 'zarr', 'numpy', 'rich')\n"
+    code += "print([m for m in heavy if m in sys.modules], file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], env=ENV, capture_output=True, text=True)
     assert done.stderr.strip() == "[]"
     for name in ("run", "prepare-assets", "train-teacher", "plan", "artifacts", "doctor"):
