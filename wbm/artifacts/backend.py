@@ -131,7 +131,9 @@ class LocalBackend:
 
     def delete(self, path: str) -> None:
         with locked(self._lock(path)):
-            (self._meta / path).unlink(missing_ok=True)
+            if (self._meta / path).exists():
+                (self._meta / path).unlink()
+                fsync_path((self._meta / path).parent)
 
     def records(self, prefix: str) -> list[str]:
         base = self._meta / prefix

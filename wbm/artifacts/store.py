@@ -284,16 +284,16 @@ class Store:
             if users:
                 raise Conflict(f"{ref}: {users[0]} was made from it; add --force to delete it all the same")
         kind, name, key = ref.split("/")
-        self.backend.remove(ref)
         self.backend.delete(f"pins/{ref}")
         found = self.backend.read(f"refs/{kind}/{name}/latest")
         if found and json.loads(found[0])["key"][:KEY_LENGTH] == key:
-            left = [self.manifest(r) for r in self.names(kind) if r.startswith(f"{kind}/{name}/")]
+            left = [self.manifest(r) for r in self.names(kind) if r.startswith(f"{kind}/{name}/") and r != ref]
             if left:
                 newest = max(left, key=lambda m: m.created)
                 self.set_latest(kind, name, newest.key)
             else:
                 self.backend.delete(f"refs/{kind}/{name}/latest")
+        self.backend.remove(ref)  # after the reference, which must never point to nothing
         return ref
 
     def stale_staging(self, grace_s: float) -> list[Path]:
