@@ -116,7 +116,7 @@ def build(cfg: DictConfig) -> Config:
         ConfigError: as `compose`.
     """
     try:
-        own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+        own = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
         values = cast("dict[str, Any]", OmegaConf.to_container(own, resolve=True, throw_on_missing=True))
     except (OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_one_line(error)) from error
