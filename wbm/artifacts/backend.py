@@ -112,7 +112,7 @@ class LocalBackend:
         self._meta = root / ".store"
 
     def _lock(self, path: str) -> Path:
-        return self._meta / "locks" / digest_bytes(path.encode())[:16]
+        return self._meta / "locks" / digest_bytes(path.encode())[:2]  # 256 locks for any number of records
 
     def read(self, path: str) -> tuple[bytes, str] | None:
         try:

@@ -307,6 +307,13 @@ class Store:
                     found.append(path)
         return found
 
+    def forget_leases(self) -> None:
+        """Delete the records of leases that nobody holds and whose attempt left nothing behind."""
+        for path in self.backend.records("leases"):
+            staging = self.backend.work / ".staging" / path.removeprefix("leases/")
+            if not is_live(self.backend, path) and not staging.exists():
+                self.backend.delete(path)
+
     def drop_folder(self, folder: Path) -> None:
         """Delete a staging or quarantine folder."""
         remove_tree(folder)
