@@ -36,6 +36,7 @@ class GraspEnv:
         state: the present `GraspState`.
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
+        phase: 0 free space, 1 contact-rich [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
     """
 
@@ -74,6 +75,17 @@ class GraspEnv:
         self.noise: Tensor | None = None
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
         self.next_episode = 0
+        self.phase = torch.ones(num_envs, dtype=torch.uint8, device=device)
+
+    @property
+    def limit_steps(self) -> int:
+        """Policy steps after which an episode ends in any case."""
+        return self.max_steps
+
+    def object_poses(self) -> Tensor:
+        """World poses of target and distractors [N,1+D,7], position and quaternion (w x y z)."""
+        first, count = self.binding.target_qpos.start, 1 + self.binding.num_distractors
+        return self.sim.qpos[:, first : first + 7 * count].view(self.num_envs, count, 7)
 
     @property
     def num_actions(self) -> int:
@@ -136,7 +148,7 @@ class GraspEnv:
             scenes = (u[:, self._pick].squeeze(1) * table.count).long().clamp_(max=table.count - 1)
         else:
             scenes = torch.from_numpy(episodes % table.count).to(self.device)
-        q = self.starts.draw(scenes, u[:, self._start].squeeze(1))
+        q = self._start_joints(ids, scenes, u)
         hand = self.cfg.randomization.start_hand
         if hand.on:
             q[:, joints.HAND] += hand.low + (hand.high - hand.low) * u[:, self._hand]
@@ -160,6 +172,18 @@ class GraspEnv:
         ee = self.reader.ee
         self.action.reset(ids, q, self.frame_pos[ids, ee], self.frame_quat[ids, ee])
 
+    def _start_joints(self, ids: Tensor, scenes: Tensor, u: Tensor) -> Tensor:
+        """Joint positions [K,32] in which the episodes of environments `ids` start."""
+        return self.starts.draw(scenes, u[:, self._start].squeeze(1))
+
+    def _contact_steps(self) -> Tensor:
+        """Policy steps [N] since the contact-rich phase began."""
+        return self.elapsed
+
+    def _time_up(self) -> Tensor:
+        """Episodes [N] whose time has run out."""
+        return self.elapsed >= self.max_steps
+
     # Steps
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
@@ -168,7 +192,9 @@ class GraspEnv:
         Returns:
             The observation [N,O] (of the next episode where one ended), rewards [N], done flags [N] and a dictionary:
             `time_outs` [N] (ended by time alone), `outcome` [N] (see `outcome.REASONS`, `RUNNING` where it goes on),
-            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step belonged to.
+            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step belonged to,
+            `ctrl` [N,32] clean joint targets, and `ended`, what the step led to before any restart: `held`, `height`,
+            `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
         """
         action = action.clamp(-self.cfg.action.limit, self.cfg.action.limit)
         s = self.state
@@ -204,24 +230,32 @@ class GraspEnv:
         self._refresh()
         reward, terms = rewards.total(self.state, action, self.previous, self.cfg.reward)
         self.previous.copy_(action)
-        code = self.outcome.update(self.state, self.reader.start_pos, self.elapsed >= self.max_steps)
+        time_up = self._time_up()
+        code = self.outcome.update(self.state, self.reader.start_pos, time_up)
         done = code != RUNNING
-        timed = done & (self.elapsed >= self.max_steps)
+        timed = done & time_up
         reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed)
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
+        info |= {"ctrl": self.ctrl.clone(), "ended": self._ended()}
         ids = done.nonzero().squeeze(1)
         if len(ids):
             self._begin(ids)
             self._refresh()
         return self.obs, reward, done, info
 
+    def _ended(self) -> dict[str, Tensor]:
+        s = self.state
+        force = s.finger_force.amax(1)
+        z = self.object_poses()[:, :, 2].clone()
+        return {"held": s.held, "height": s.height, "force": force, "forbidden": s.forbidden, "object_z": z}
+
     def _refresh(self) -> None:
         """Recompute frames, state and observation from the simulation."""
         self.q_in.copy_(self.sim.qpos[:, : joints.NUM_JOINTS])
         self.controller.forward_kinematics()
         self.state = s = self.reader.read(self.frame_pos, self.frame_quat)
-        time = self.elapsed / self.max_steps
+        time = self._contact_steps() / self.max_steps
         offset = self.action.offset(s.q, s.ee_pos_w, s.ee_quat)
         self.obs = self.observe(
             s, self.ctrl[:, joints.HAND], self.reader.support, self.min_distance, time, offset, self.previous
