@@ -18,7 +18,8 @@ from wbm.robot.spheres import SphereSet
 class Tables:
     """Host tables; B moving bodies, S spheres (in the caller's order), G groups of spheres, Q blocks of P pairs.
 
-    `body_of_link [L]`, `link_pos [L,3]`, `link_rot [L,3,3]` place a link in its body. `mask` fields hold one bit for each controlled joint that moves a thing.
+    `body_of_link [L]`, `link_pos [L,3]`, `link_rot [L,3,3]` place a link in its body.
+    `mask` fields hold one bit for each controlled joint that moves a thing.
     """
 
     tree: dict[str, np.ndarray]

@@ -250,7 +250,8 @@ class WholeBodyController:
 
     def _launch_distances(self) -> None:
         n, m, groups = self.num_envs, self.num_obstacles, len(self._tables.group_mask)
-        tree, reach = self._tree, self.cfg.reach
+        tree, reach = self._tree, [self.gains, self.cfg.reach, self._region_start]
+        placed = [self._obstacle_rot, self._obstacle_ball, self.sphere_margin, *reach]
         found = [self._count, self._nearest, self._force, self._moment, self._gap, self._mask]
         self._run(
             kinematics.place_spheres,
@@ -267,15 +268,13 @@ class WholeBodyController:
         self._run(
             distance.obstacle_candidates,
             (n, groups),
-            [tree, self._sphere_pos, self._ball, self._group_mask, self.obstacle_type, self.obstacle_size]
-            + [self._obstacle_rot, self._obstacle_ball, self.sphere_margin, self.gains, reach, self._region_start],
+            [tree, self._sphere_pos, self._ball, self._group_mask, self.obstacle_type, self.obstacle_size, *placed],
             found,
         )
         self._run(
             distance.self_candidates,
             n,
-            [tree, self._sphere_pos, self._ball, self._block, self._block_mask, self._pair, self.gains, reach]
-            + [self._region_start],
+            [tree, self._sphere_pos, self._ball, self._block, self._block_mask, self._pair, *reach],
             found,
         )
 
@@ -309,6 +308,7 @@ class WholeBodyController:
         )
 
     def _launch_qp(self, tasks: list[wp.array]) -> None:
+        problem = [*tasks, self._diag, self._rhs, self._low, self._high, self._rows, self._row, self._bound]
         found = [self._region_start, self._count, self._nearest, self._force, self._moment, self._gap, self._mask]
         self._run(
             wbc_assemble.select_collisions,
@@ -319,8 +319,7 @@ class WholeBodyController:
         self._run(
             wbc_qp.solve_qp,
             self.num_envs,
-            [*tasks, self._diag, self._rhs, self._low, self._high, self._rows, self._row, self._bound]
-            + [self.cfg.slack_weight, self.cfg.iterations, self._qd_from],
+            [*problem, self.cfg.slack_weight, self.cfg.iterations, self._qd_from],
             [self._x, self.iterations],
         )
 

@@ -6,6 +6,7 @@ relative to a reference point near the robot. A pair that is nearer than the rea
 move it. `n^T p_dot = sum_j sigma_j (w_j . moment + m_j . n) qd_j` then needs no Jacobian of the point itself.
 """
 
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3
@@ -132,7 +133,7 @@ def place_obstacles(
 ):
     """Rotation and bounding ball of each obstacle; one with a value that is not finite counts as unused."""
     e, k = wp.tid()
-    radius = -1.0
+    radius = float(-1.0)
     centre = wp.vec3()
     if kind[e, k] != NO_OBSTACLE and _finite3(pos[e, k]) and _finite3(size[e, k]):
         radius = wp.min(bounding_radius(kind[e, k], size[e, k]), FAR)
@@ -153,7 +154,7 @@ def _slot(
     """Where a candidate goes in a full or growing list: the next free cell, the worst one, or nowhere (-1)."""
     slot = start + count
     if count >= capacity:
-        slot = -1
+        slot = int(-1)
         worst = gap
         for i in range(start, start + capacity):
             if gap_array[e, i] > worst:
@@ -192,7 +193,7 @@ def obstacle_candidates(
     last = tree.group_start[g + 1]
     start = region_start[g]
     capacity = region_start[g + 1] - start
-    count = 0
+    count = int(0)
     nearest = FAR
     worst_margin = float(-FAR)
     for s in range(first, last):
@@ -254,7 +255,7 @@ def self_candidates(
     region = region_start.shape[0] - 2
     start = region_start[region]
     capacity = region_start[region + 1] - start
-    count = 0
+    count = int(0)
     nearest = FAR
     safe = gains[e, K_SAFE_SELF]
     limit = reach + safe

@@ -6,6 +6,7 @@ that this holds). Fixed links are folded into offsets. The controlled joints' mo
 point near the robot, which keeps float32 exact to a micrometre wherever the robot stands.
 """
 
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3
@@ -116,7 +117,7 @@ def place_spheres(
             sphere_pos_out[e, s] = p
             centre += p
         centre = centre / float(end - start)
-        radius = 0.0
+        radius = float(0.0)
         for s in range(start, end):
             radius = wp.max(radius, wp.length(sphere_pos_out[e, s] - centre) + tree.sphere_radius[s])
         group_ball_out[e, g] = wp.vec4(centre[0], centre[1], centre[2], radius)

@@ -4,6 +4,7 @@ min 1/2 sum_r w_r (J_r qd - v_r)^2 + 1/2 sum_i (h_i qd_i^2 - 2 g_i qd_i) + 1/2 r
 subject to low <= qd <= high, A_k qd + s_k >= b_k, s_k >= 0
 """
 
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import wbc_objectives as obj
@@ -168,7 +169,7 @@ def joint_diagonal(
         q_j = finite_or(q[e, limits.joint[j]], 0.0)
         posture = targets.weights[e, obj.W_POSTURE]
         h = targets.weights[e, obj.W_DAMPING]
-        g = 0.0
+        g = float(0.0)
         if lever > 0.0:
             posture = targets.weights[e, obj.W_POSTURE_BASE]
             smooth = lever * lever * targets.weights[e, obj.W_SMOOTHNESS]
@@ -279,7 +280,7 @@ def select_collisions(
     unchanged. Of the rest the K with the least to spare are kept.
     """
     e = wp.tid()
-    used = 0
+    used = int(0)
     closest = nearest[e, 0]
     for g in range(count.shape[1]):
         closest = wp.min(closest, nearest[e, g])
@@ -287,7 +288,7 @@ def select_collisions(
             bound = approach_bound(
                 gap[e, i], gains[e, obj.K_GAMMA], gains[e, obj.K_BRAKE], gains[e, obj.K_ESCAPE], limits.dt
             )
-            worst = 0.0
+            worst = float(0.0)
             for j in range(screw.shape[1]):
                 a = row_entry(screw[e, j], moment[e, i], force[e, i], mask[e, i], j)
                 worst += wp.min(a * float(low[e, j]), a * float(high[e, j]))
@@ -295,7 +296,7 @@ def select_collisions(
             if spare < 0.0:
                 slot = used
                 if used == row_out.shape[1]:
-                    slot = -1
+                    slot = int(-1)
                     most = spare
                     for k in range(used):
                         if spare_out[e, k] > most:

@@ -4,6 +4,7 @@ Rows 0-2 are the hand's linear velocity, 3-5 its angular velocity, 6-7 the gaze,
 joint-limit centring, base weight, base smoothness and damping act on single joints and are a diagonal.
 """
 
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3
@@ -25,9 +26,10 @@ GAIN_NAMES = (
     "distance_min", "distance_max", "safe_obstacle", "safe_self", "gamma", "brake", "escape",
     "ee_damping", "repulsion",
 )  # fmt: skip
-W_EE_POSITION, W_EE_ROTATION, W_GAZE, W_DISTANCE, W_POSTURE, W_POSTURE_BASE, W_CENTRING, W_BASE, W_SMOOTHNESS, W_DAMPING, W_COLLISION = (
-    wp.constant(i) for i in range(len(WEIGHT_NAMES))
-)  # fmt: skip
+(
+    W_EE_POSITION, W_EE_ROTATION, W_GAZE, W_DISTANCE, W_POSTURE, W_POSTURE_BASE,
+    W_CENTRING, W_BASE, W_SMOOTHNESS, W_DAMPING, W_COLLISION,
+) = (wp.constant(i) for i in range(len(WEIGHT_NAMES)))  # fmt: skip
 (
     K_EE_POSITION, K_EE_ROTATION, K_GAZE, K_DISTANCE, K_POSTURE, K_CENTRING, K_EE_SPEED, K_EE_TURN, K_GAZE_TURN,
     K_DISTANCE_MIN, K_DISTANCE_MAX, K_SAFE_OBSTACLE, K_SAFE_SELF, K_GAMMA, K_BRAKE, K_ESCAPE,
@@ -100,7 +102,7 @@ def gaze_rows(w: wp.vec3, v: wp.vec3, theta: float, u: wp.vec3, t: wp.vec3, dist
     for zero. Its factor grows without bound near 180 degrees and is held at its value at 90 degrees there: beyond
     it the camera may leave the great circle, which costs nothing.
     """
-    factor = 1.0
+    factor = float(1.0)
     if theta > 0.01:
         factor = AZIMUTH_FACTOR_MAX
         if theta < AZIMUTH_FACTOR_MAX:

@@ -10,6 +10,7 @@ turns the camera towards the target. (4) needs a floor on d to be run at all. Wh
 the velocity and position limits, as a low-level controller would; nothing limits its change.
 """
 
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import wbc_objectives as obj
@@ -39,7 +40,7 @@ def paper_tasks(
     """Adds the damping of (2) to the hand's rows and puts (3) in the place of gaze and viewing distance."""
     e = wp.tid()
     for r in range(6):
-        speed = 0.0
+        speed = float(0.0)
         for j in range(screw.shape[1]):
             speed += jac_out[e, r, j] * qd_prev[e, j]
         vel_out[e, r] = vel_out[e, r] - targets.gains[e, obj.K_EE_DAMPING] * speed

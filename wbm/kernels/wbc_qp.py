@@ -6,6 +6,7 @@ against their bound, takes the Newton step of the others (Cholesky of at most 16
 makes the matrix stiff), projects it onto the box and halves it until the function falls (Bertsekas, 1982).
 """
 
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -138,8 +139,8 @@ def solve_qp(
         x[i] = wp.clamp(wp.float64(qd_start[e, i]), low[e, i], high[e, i])
     smooth = gradient_of(hessian, linear, x, n)
     cost = HALF * (wp.dot(x, smooth) - wp.dot(x, linear)) + HALF * slack_weight * damper_cost(e, n, rows, row, bound, x)
-    done = 0
-    used = 0
+    done = int(0)
+    used = int(0)
     while done == 0 and used < iterations:
         used += 1
         gradient = smooth
@@ -173,7 +174,7 @@ def solve_qp(
         else:
             step = cholesky_solve(matrix, step, n)
             length = ONE
-            accepted = 0
+            accepted = int(0)
             for _attempt in range(6):
                 if accepted == 0:
                     trial = vec16()
