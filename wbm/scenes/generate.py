@@ -91,7 +91,7 @@ def settle(model: SceneModel, bank: SceneBank, cfg: ScenesConfig) -> SceneBank:
 
 
 def simulate(model: SceneModel, bank: SceneBank, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses [K,1+D,3], [K,1+D,4] of the objects after `seconds` with the robot held, and [K] whether the robot touched."""
+    """Poses [K,1+D,3], [K,1+D,4] of the objects after `seconds` with the robot held, and [K] whether it touched."""
     physics = model.model
     options = (physics.opt.timestep, physics.opt.integrator, physics.opt.cone, physics.opt.ls_iterations)
     physics.opt.timestep, physics.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -104,7 +104,7 @@ def simulate(model: SceneModel, bank: SceneBank, seconds: float) -> tuple[np.nda
     ctrl[:] = bank.q_start
     sensors = [batch.sensor(name)[:, 0] for name in model.sensors if name.startswith("robot_")]
     touched = np.zeros(len(bank), dtype=bool)
-    steps = int(round(seconds / STEP))
+    steps = round(seconds / STEP)
     for _ in range(10):
         batch.step(nstep=max(1, steps // 10))
         touched |= np.any([s > 0 for s in sensors], axis=0)
