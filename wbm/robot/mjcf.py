@@ -11,6 +11,7 @@ import numpy as np
 from wbm.robot import joints
 from wbm.robot.config import MjcfOptions
 from wbm.robot.model import HINGE, RobotModel, load_robot
+from wbm.robot.spheres import moving_joints
 
 ROBOT_BIT, OBJECT_BIT, STATIC_BIT = 1, 2, 4
 """Collision bits: everything collides with everything, but statics and unused slots not with statics."""
@@ -22,7 +23,7 @@ CONTACT_VALUES = 4
 """Values of one contact sensor: number of contacts, then the net force (N, world frame) on the second body."""
 
 _SAMPLES = 256
-_ALWAYS_TOUCHING = 0.25
+_OFTEN_TOUCHING = 0.25
 
 
 def build_robot(spec: mujoco.MjSpec, robot: RobotModel, options: MjcfOptions | None = None) -> None:
@@ -115,10 +116,10 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel, options: MjcfOptions)
 
 @cache
 def excluded_pairs(robot: RobotModel, self_collision: bool = True) -> tuple[tuple[str, str], ...]:
-    """Body pairs whose contact is not simulated: those whose primitives touch most of the time.
+    """Body pairs whose contact is not simulated: near neighbours whose primitives touch in many configurations.
 
-    Found by sampling configurations (parents and children are already left out by MuJoCo), seeded. With
-    `self_collision` off, every pair outside the hand is excluded too.
+    Found by sampling configurations (parents and children are already left out by MuJoCo), seeded; near means at most
+    two joints apart. With `self_collision` off, every pair outside the hand is excluded too.
     """
     spec = mujoco.MjSpec()
     _add_links(spec, robot, MjcfOptions())
@@ -136,7 +137,9 @@ def excluded_pairs(robot: RobotModel, self_collision: bool = True) -> tuple[tupl
         for pair in pairs:
             count[pair] = count.get(pair, 0) + 1
     names = [model.body(i).name for i in range(model.nbody)]
-    excluded = {pair for pair, hits in count.items() if hits > _ALWAYS_TOUCHING * _SAMPLES}
+    often = {pair for pair, hits in count.items() if hits > _OFTEN_TOUCHING * _SAMPLES}
+    links = [robot.link(name) for name in names]
+    excluded = {(a, b) for a, b in often if len(moving_joints(robot, links[a], links[b])) <= 2}
     if not self_collision:
         body = [i for i, name in enumerate(names) if i > 0 and not name.startswith("hand_")]
         hand = [i for i, name in enumerate(names) if name.startswith("hand_")]

@@ -37,8 +37,8 @@ def menagerie_xml(model: str, entry: str, file: str) -> Path:
         import mujoco_menagerie
     except ImportError:
         raise FileNotFoundError(
-            "robot.skin=menagerie needs the published meshes: `pip install mujoco-menagerie`, or set MENAGERIE_ROOT to a "
-            "copy of github.com/google-deepmind/mujoco_menagerie; robot.skin=primitives needs neither"
+            "robot.skin=menagerie needs the published meshes: `pip install mujoco-menagerie`, or set MENAGERIE_ROOT to "
+            "a copy of github.com/google-deepmind/mujoco_menagerie; robot.skin=primitives needs neither"
         ) from None
     try:
         return Path(mujoco_menagerie.get(model).xml(entry))

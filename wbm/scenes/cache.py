@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
 import tempfile
 import zipfile
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -47,3 +49,26 @@ def store_arrays(section: str, key: str, **arrays: np.ndarray) -> None:
     except OSError:
         if temporary and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+@cache
+def code_digest() -> str:
+    """Digest of the sources of this room and of the robot's: what is drawn and settled depends on both."""
+    here = Path(__file__).parent
+    digest = hashlib.blake2b(digest_size=16)
+    for folder in (here, here.parent / "robot"):
+        for path in sorted(folder.glob("*.py")) + sorted(folder.glob("*.yaml")):
+            digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def array_digest(*parts: object) -> str:
+    """Digest of arrays and of anything whose `repr` says what it is."""
+    digest = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype.str}{part.shape}".encode())
+            digest.update(np.ascontiguousarray(part).tobytes())
+        else:
+            digest.update(repr(part).encode())
+    return digest.hexdigest()

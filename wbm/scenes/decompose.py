@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -33,15 +34,18 @@ class Imported:
     rule: str = ""
 
 
-def import_mesh(path: Path, cfg: ObjectsConfig) -> Imported:
-    """Read, repair, scale and decompose one file, or take the result from the cache. Bad files give a reason."""
+def cached_import(path: Path, cfg: ObjectsConfig) -> Imported | None:
+    """The result for this file's content, if an earlier run kept it; a reason if the file cannot even be read."""
     try:
-        key = _key(path, cfg)
+        kept = load_arrays(_SECTION, _key(path, cfg))
     except OSError as error:
         return Imported([], f"cannot be read ({error.strerror})")
-    kept = load_arrays(_SECTION, key)
-    if kept is not None:
-        return _unpack(kept)
+    return _unpack(kept) if kept is not None else None
+
+
+def import_mesh(path: Path, cfg: ObjectsConfig) -> Imported:
+    """Read, repair, scale and decompose one file, and keep the result. A file that cannot be used gives a reason."""
+    key = _key(path, cfg)
     try:
         mesh = read_mesh(path, cfg)
         factor, rule = scale_rule(mesh.extents, cfg.extent)
@@ -70,14 +74,15 @@ def _key(path: Path, cfg: ObjectsConfig) -> str:
 
 def _unpack(kept: dict[str, np.ndarray]) -> Imported:
     starts, vertices = kept["starts"], kept["vertices"]
-    hulls = [vertices[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    hulls = [vertices[a:b] for a, b in pairwise(starts)]
     return Imported(hulls, str(kept["words"][0]), str(kept["words"][1]))
 
 
 def convex_parts(mesh: trimesh.Trimesh, cfg: ObjectsConfig) -> list[np.ndarray]:
     """Vertices of at most `cfg.max_hulls` convex hulls that together fill the mesh (m).
 
-    A convex mesh is its own hull; a mesh of few convex bodies is taken as it is; all others go to CoACD (Wei et al. 2022).
+    A convex mesh is its own hull; a mesh of few convex bodies is taken as it is; all others go to CoACD (Wei et al.
+    2022).
     """
     if filled_share(mesh) > CONVEX:
         return _thick([mesh.vertices], cfg)

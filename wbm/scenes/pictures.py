@@ -52,7 +52,7 @@ def object_sheet(objects: ObjectSet, path: Path, size: tuple[int, int] = (112, 1
     tiles = []
     for o in shown:
         model, data = _alone(objects, int(o))
-        image = render(model, data, np.array([-0.26, -0.22, 0.26]), np.zeros(3), size, 28.0)
+        image = render(model, data, np.array([0.26, -0.24, 0.26]), np.zeros(3), size, 28.0)
         words = [str(objects.size_word[o]), str(objects.color[o]), str(objects.noun[o])]
         tiles.append((image, " ".join(w for w in words if w)))
     _write_sheet(tiles, columns, path)
@@ -73,8 +73,8 @@ def scene_sheet(objects: ObjectSet, bank: SceneBank, path: Path, size: tuple[int
         data = mujoco.MjData(compiled)
         mujoco.mj_resetDataKeyframe(compiled, data, 0)
         mujoco.mj_forward(compiled, data)
-        target = bank.object_pos[k, 0]
-        image = render(compiled, data, target + np.array([-1.5, -1.3, 0.95]), target + [-0.3, 0.0, -0.1], size, 45.0)
+        middle = 0.65 * bank.object_pos[k, 0] + 0.35 * np.array([*bank.q_start[k, :2], 0.5])
+        image = render(compiled, data, middle + np.array([-1.2, -1.9, 1.1]), middle - [0.0, 0.0, 0.05], size, 42.0)
         tiles.append(
             (image, f"{KINDS[bank.kind[k]]}: {objects.color[bank.object[k, 0]]} {objects.noun[bank.object[k, 0]]}")
         )

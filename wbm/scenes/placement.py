@@ -140,7 +140,7 @@ def _matrix(quat: np.ndarray) -> np.ndarray:
 def _start(
     robot: RobotModel, pos: np.ndarray, size: np.ndarray, quat: np.ndarray, target: np.ndarray, cfg: ScenesConfig, rng
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """A start configuration [32] clear of supports and of itself, and the base pose [3] that has the target in reach."""
+    """A start configuration [32] clear of supports and of itself, and the base pose [3] from which to grasp."""
     heading = 2 * np.arctan2(quat[3], quat[0]) + rng.uniform(-0.15, 0.15)
     ahead = np.array([np.cos(heading), np.sin(heading)])
     grasp = np.r_[target[:2] - cfg.grasp_reach * ahead, heading]

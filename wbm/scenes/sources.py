@@ -5,14 +5,14 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wbm.scenes.config import ObjectsConfig
-from wbm.scenes.decompose import Imported, import_mesh
+from wbm.scenes.decompose import Imported, cached_import, import_mesh
 from wbm.scenes.families import Draft
 from wbm.scenes.isolate import run_isolated
 from wbm.scenes.meshfile import SUFFIXES
@@ -88,7 +88,7 @@ def import_objects(
     """
     workers = cfg.workers or os.cpu_count() or 1
     results: list[Imported] = [Imported([])] * len(files)
-    for _ in track(_collect(results, files, cfg, workers)):
+    for _ in track(_Imports(results, files, cfg, workers)):
         pass
     names = [path.relative_to(root).as_posix() for path in files]
     skipped = {n: r.reason for n, r in zip(names, results, strict=True) if not r.hulls}
@@ -103,8 +103,8 @@ def import_objects(
     return stack_objects(entries), {"source": cfg.source, "read": len(files), "skipped": skipped, "scaled": scaled}
 
 
-class _collect:
-    """Iterates over finished imports, filling `results`; its length is the number of files, for the progress bar."""
+class _Imports:
+    """Iterates over finished imports, filling `results`; its length is the number of files, for a progress bar."""
 
     def __init__(self, results: list[Imported], files: list[Path], cfg: ObjectsConfig, workers: int) -> None:
         self._results, self._files, self._cfg, self._workers = results, files, cfg, workers
@@ -112,11 +112,19 @@ class _collect:
     def __len__(self) -> int:
         return len(self._files)
 
-    def __iter__(self):
-        jobs = [(path, self._cfg) for path in self._files]
-        for index, result, reason in run_isolated(import_mesh, jobs, self._workers, TIMEOUT, MEMORY_MB):
-            self._results[index] = result if result is not None else Imported([], reason)
+    def __iter__(self) -> Iterator[int]:
+        fresh = []
+        for index, path in enumerate(self._files):
+            kept = cached_import(path, self._cfg)
+            if kept is None:
+                fresh.append(index)
+                continue
+            self._results[index] = kept
             yield index
+        jobs = [(self._files[index], self._cfg) for index in fresh]
+        for number, result, reason in run_isolated(import_mesh, jobs, self._workers, TIMEOUT, MEMORY_MB):
+            self._results[fresh[number]] = result if result is not None else Imported([], reason)
+            yield fresh[number]
 
 
 def choose_held_out(families: list[str], cfg: ObjectsConfig, seed: int) -> tuple[str, ...]:
