@@ -68,7 +68,7 @@ class RaySensor:
         self.noise, self.extrinsic = noise or RayNoise(), extrinsic or ExtrinsicNoise()
         self.noise.seed = self.seed
         # A corner ray is longer than its planar depth.
-        self._reach = self.max_range / float(rays[..., 2].min()) if planar else self.max_range
+        self.reach = self.max_range / float(rays[..., 2].min()) if planar else self.max_range
         self.table: RayTable = build_table(rays, bundle)
         self.num_envs, self.num_rays = scene.num_envs, rays.shape[1]
         self._upload_table()
@@ -155,7 +155,7 @@ class RaySensor:
             dim=num,
             inputs=[
                 ids, self.true_pos, self.true_quat, self.exclude_body, wp.vec3(*axis), float(np.cos(half)),
-                max(float(np.sin(half)), 0.0), self._reach, s.body_pos, s.body_quat, s.type, s.size, s.mesh, s.body,
+                max(float(np.sin(half)), 0.0), self.reach, s.body_pos, s.body_quat, s.type, s.size, s.mesh, s.body,
                 s.pos, s.quat, s.mesh_ids, s.mesh_sphere,
             ],
             outputs=[
@@ -175,7 +175,7 @@ class RaySensor:
             trace_rays,
             dim=(num, self.num_rays),
             inputs=[
-                ids, self.pattern, self._sorted, self._order, self.bundle, self._reach, self._inst, self._kind,
+                ids, self.pattern, self._sorted, self._order, self.bundle, self.reach, self._inst, self._kind,
                 self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count, self._cand,
             ],
             outputs=[self.true_range, self.true_instance],
