@@ -332,6 +332,7 @@ def trace_rays(
     direction: wp.array2d[wp.vec3],  # [Q,R] unit, bundle order, sensor frame
     order: wp.array2d[int],  # [Q,R] bundle order -> ray
     bundle: int,
+    chunk: int,  # rays of a thread
     max_range: float,
     slot_inst: wp.array2d[int],  # [N,I]
     kind: wp.array2d[int],
@@ -348,30 +349,31 @@ def trace_rays(
     instance_out: wp.array2d[int],  # [N,R] -1 where nothing is hit
 ):
     """Nearest hit of every ray along its bundle's list."""
-    i, k = wp.tid()
+    i, c = wp.tid()
     env = env_ids[i]
     row = pattern[env]
-    d = direction[row, k]
-    g = k // bundle
-    best = float(max_range)
-    hit = int(-1)
-    for j in range(cand_count[env, g]):
-        s = int(cand[env, g, j])
-        if near[env, s] > best:
-            break
-        s4 = sphere[env, s]
-        c = wp.vec3(s4[0], s4[1], s4[2])
-        t_mid = wp.dot(c, d)
-        aside = c - t_mid * d
-        if wp.dot(aside, aside) <= s4[3] * s4[3]:
-            t = ray_instance(kind[env, s], origin[env, s], rot[env, s] * d, size[env, s], mesh[env, s], best)
-            if t < best:
-                best = t
-                hit = s
-    out = order[row, k]
-    if hit >= 0:
-        range_out[env, out] = best
-        instance_out[env, out] = slot_inst[env, hit]
-    else:
-        range_out[env, out] = -1.0
-        instance_out[env, out] = -1
+    for k in range(c * chunk, wp.min((c + 1) * chunk, direction.shape[1])):
+        d = direction[row, k]
+        g = k // bundle
+        best = float(max_range)
+        hit = int(-1)
+        for j in range(cand_count[env, g]):
+            s = int(cand[env, g, j])
+            if near[env, s] > best:
+                break
+            s4 = sphere[env, s]
+            centre = wp.vec3(s4[0], s4[1], s4[2])
+            t_mid = wp.dot(centre, d)
+            aside = centre - t_mid * d
+            if wp.dot(aside, aside) <= s4[3] * s4[3]:
+                t = ray_instance(kind[env, s], origin[env, s], rot[env, s] * d, size[env, s], mesh[env, s], best)
+                if t < best:
+                    best = t
+                    hit = s
+        out = order[row, k]
+        if hit >= 0:
+            range_out[env, out] = best
+            instance_out[env, out] = slot_inst[env, hit]
+        else:
+            range_out[env, out] = -1.0
+            instance_out[env, out] = -1
