@@ -6,7 +6,7 @@ touches the bundle's cone (`cull_bundles`), nearest first, so that a ray stops a
 its hit (`trace_rays`). Geometry types and sizes use MuJoCo's numbers. Distances are along unit rays, in metres.
 """
 
-# ruff: noqa: RUF046, UP018 (int(0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, SIM109, UP018 (int(0) declares a dynamic variable in a Warp kernel; `in` is not compiled)
 import warp as wp
 
 from wbm.kernels.se3 import quat_wxyz_normalize, quat_wxyz_to_mat
@@ -284,6 +284,28 @@ def place_instances(
         count_out[env] = 0
 
 
+@wp.func
+def is_leaving(kind: int, o: wp.vec3, size: wp.vec3, axis: wp.vec3, cos_half: float, sin_half: float) -> bool:
+    """Whether a face's outer half space holds the origin and every ray of a cone leads further out; instance frame.
+
+    The least component of a cone's directions along a face normal n is `cos(angle(axis, n) + half)`.
+    """
+    if kind == CAPSULE or kind == SPHERE or kind == MESH:
+        return False
+    for i in range(3):
+        extent = size[i]
+        if kind == PLANE:
+            extent = 0.0
+        if kind == CYLINDER:
+            extent = size[1]
+        side = wp.sign(o[i])
+        if (kind == BOX or i == 2) and wp.abs(o[i]) > extent:
+            a = side * axis[i]
+            if a * cos_half - wp.sqrt(wp.max(1.0 - a * a, 0.0)) * sin_half > 1.0e-4:
+                return True
+    return False
+
+
 @wp.kernel(enable_backward=False)
 def cull_bundles(
     # in:
@@ -293,11 +315,15 @@ def cull_bundles(
     count: wp.array[int],  # [N]
     sphere: wp.array2d[wp.vec4],  # [N,I]
     near: wp.array2d[float],  # [N,I]
+    kind: wp.array2d[int],
+    size: wp.array2d[wp.vec3],
+    rot: wp.array2d[wp.mat33],
+    origin: wp.array2d[wp.vec3],
     # out:
     cand_count_out: wp.array2d[int],  # [N,G]
     cand_out: wp.array3d[wp.int16],  # [N,G,I] slots, nearest first
 ):
-    """Slots whose bounding sphere touches each bundle's cone, sorted by their nearest range."""
+    """Slots whose bounding sphere touches each bundle's cone and that lie ahead, sorted by their nearest range."""
     i, g = wp.tid()
     env = env_ids[i]
     c4 = cone[pattern[env], g]
@@ -313,7 +339,11 @@ def cull_bundles(
         # The line's distance is a lower bound of the cone's; behind the apex a half space is the better one.
         if cos_half < 0.0 or along > -r:
             aside = wp.sqrt(wp.max(wp.length_sq(c) - along * along, 0.0))
-            if aside * cos_half - along * sin_half <= r:
+            touches = aside * cos_half - along * sin_half <= r
+            if touches and cos_half > 0.0:
+                local = rot[env, s] * axis
+                touches = not is_leaving(kind[env, s], origin[env, s], size[env, s], local, cos_half, sin_half)
+            if touches:
                 key = near[env, s]
                 j = int(num)
                 while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
@@ -352,28 +382,44 @@ def trace_rays(
     i, c = wp.tid()
     env = env_ids[i]
     row = pattern[env]
-    for k in range(c * chunk, wp.min((c + 1) * chunk, direction.shape[1])):
-        d = direction[row, k]
-        g = k // bundle
-        best = float(max_range)
-        hit = int(-1)
-        for j in range(cand_count[env, g]):
-            s = int(cand[env, g, j])
-            if near[env, s] > best:
-                break
-            s4 = sphere[env, s]
-            centre = wp.vec3(s4[0], s4[1], s4[2])
-            t_mid = wp.dot(centre, d)
-            aside = centre - t_mid * d
-            if wp.dot(aside, aside) <= s4[3] * s4[3]:
-                t = ray_instance(kind[env, s], origin[env, s], rot[env, s] * d, size[env, s], mesh[env, s], best)
-                if t < best:
-                    best = t
-                    hit = s
+    first = c * chunk
+    end = wp.min(first + chunk, direction.shape[1])
+    g = first // bundle
+    for k in range(first, end):
         out = order[row, k]
-        if hit >= 0:
-            range_out[env, out] = best
-            instance_out[env, out] = slot_inst[env, hit]
-        else:
+        range_out[env, out] = max_range
+        instance_out[env, out] = -1
+    # An instance's data is loaded once for all rays of the thread; it may stop when all hits lie before the next one.
+    farthest = float(max_range)
+    for j in range(cand_count[env, g]):
+        s = int(cand[env, g, j])
+        start = near[env, s]
+        if start > farthest:
+            break
+        s4 = sphere[env, s]
+        centre = wp.vec3(s4[0], s4[1], s4[2])
+        radius_sq = s4[3] * s4[3]
+        inst = slot_inst[env, s]
+        shape = kind[env, s]
+        R_IS = rot[env, s]
+        o = origin[env, s]
+        extent = size[env, s]
+        mesh_id = mesh[env, s]
+        farthest = float(0.0)
+        for k in range(first, end):
+            out = order[row, k]
+            best = range_out[env, out]
+            if start <= best:
+                d = direction[row, k]
+                aside = centre - wp.dot(centre, d) * d
+                if wp.dot(aside, aside) <= radius_sq:
+                    t = ray_instance(shape, o, R_IS * d, extent, mesh_id, best)
+                    if t < best:
+                        best = t
+                        range_out[env, out] = t
+                        instance_out[env, out] = inst
+            farthest = wp.max(farthest, best)
+    for k in range(first, end):
+        out = order[row, k]
+        if instance_out[env, out] < 0:
             range_out[env, out] = -1.0
-            instance_out[env, out] = -1

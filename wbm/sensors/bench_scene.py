@@ -26,7 +26,7 @@ COLORS = np.array([[0.85, 0.2, 0.2], [0.2, 0.45, 0.85], [0.25, 0.65, 0.3], [0.95
 
 def sample_meshes(detail: int = 4) -> list[tuple[np.ndarray, np.ndarray]]:
     """Four closed meshes 0.1 to 0.25 m large; detail 4 gives 4 to 5 thousand triangles each."""
-    n = 6 * 2**detail // 2 + 2 * detail
+    n = 8 + 13 * detail
     profile = np.linspace(0, 1, n // 2)
     bottle = np.stack([0.036 - 0.022 / (1 + np.exp(-14 * (profile - 0.7))), 0.2 * profile - 0.1], axis=1)
     bowl = np.concatenate(
@@ -37,9 +37,9 @@ def sample_meshes(detail: int = 4) -> list[tuple[np.ndarray, np.ndarray]]:
     )
     shapes = [
         trimesh.creation.icosphere(subdivisions=detail, radius=0.06),
-        trimesh.creation.torus(0.055, 0.02, major_sections=2 * n // 2 + 8, minor_sections=n // 2 + 4),
-        trimesh.creation.revolve(_closed(bottle), sections=n),
-        trimesh.creation.revolve(_closed(bowl), sections=n // 2 + 4),
+        trimesh.creation.torus(0.055, 0.02, major_sections=n + 8, minor_sections=n // 2 + 4),
+        trimesh.creation.revolve(_closed(bottle), sections=n + 12),
+        trimesh.creation.revolve(_closed(bowl), sections=n * 2 // 3 + 4),
     ]
     return [(np.asarray(s.vertices, np.float64), np.asarray(s.faces)) for s in shapes]
 

@@ -26,7 +26,8 @@ class MujocoScene:
         used = np.flatnonzero(instances.type != UNUSED)
         for k in np.unique(instances.mesh[instances.type == MESH]):
             vertices, faces = meshes[k]
-            spec.add_mesh(name=f"m{k}", uservert=vertices.ravel().tolist(), userface=faces.ravel().tolist())
+            mesh = spec.add_mesh(name=f"m{k}", uservert=vertices.ravel().tolist(), userface=faces.ravel().tolist())
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         for i in used:
             kind = int(instances.type[i])
             if kind == PLANE:

@@ -169,10 +169,13 @@ class RaySensor:
         wp.launch(
             cull_bundles,
             dim=(num, self._cand_count.shape[1]),
-            inputs=[ids, self.pattern, self._cone, self._count, self._sphere, self._near],
+            inputs=[
+                ids, self.pattern, self._cone, self._count, self._sphere, self._near, self._kind, self._size, self._rot,
+                self._origin,
+            ],
             outputs=[self._cand_count, self._cand],
             device=device,
-        )
+        )  # fmt: skip
         wp.launch(
             trace_rays,
             dim=(num, -(-self.num_rays // self._chunk)),
