@@ -224,8 +224,9 @@ def place_instances(
     mesh_out: wp.array2d[wp.uint64],
     rot_out: wp.array2d[wp.mat33],  # sensor frame -> instance frame
     origin_out: wp.array2d[wp.vec3],  # sensor origin in the instance frame
-    sphere_out: wp.array2d[wp.vec4],  # bounding sphere in the sensor frame
-    near_out: wp.array2d[float],  # nearest range of the bounding sphere
+    sphere_out: wp.array2d[wp.vec4],  # centre c of the bounding sphere in the sensor frame, |c|^2 - r^2
+    cone_out: wp.array2d[wp.vec4],  # direction of its centre, cosine of its angular radius
+    near_out: wp.array2d[float],  # its nearest range, 0 if it holds the sensor
 ):
     """List the instances that the sensor may see, in its own frame; `ok` is 0 where no ray can be trusted."""
     env = env_ids[wp.tid()]
@@ -273,8 +274,13 @@ def place_instances(
                     mesh_out[env, count] = mesh
                     rot_out[env, count] = wp.transpose(R_WI) * R_WS
                     origin_out[env, count] = origin
-                    sphere_out[env, count] = wp.vec4(c[0], c[1], c[2], radius * 1.0001)
-                    near_out[env, count] = wp.max(distance - radius * 1.0001, 0.0)
+                    # Widened, so that rounding never loses a hit.
+                    bound = wp.min(radius * 1.0001 + 1.0e-6 * distance, UNBOUNDED)
+                    sphere_out[env, count] = wp.vec4(c[0], c[1], c[2], distance * distance * 0.999999 - bound * bound)
+                    near_out[env, count] = wp.max(distance - bound, 0.0)
+                    u = c / wp.max(distance, 1.0e-9)
+                    sine = wp.min(bound / wp.max(distance, 1.0e-9), 1.0)
+                    cone_out[env, count] = wp.vec4(u[0], u[1], u[2], wp.sqrt(1.0 - sine * sine))
                     count += 1
     if ok:
         ok_out[env] = 1
@@ -313,7 +319,7 @@ def cull_bundles(
     pattern: wp.array[int],  # [N] row of the ray table
     cone: wp.array2d[wp.vec4],  # [Q,G] axis, cosine of the half angle
     count: wp.array[int],  # [N]
-    sphere: wp.array2d[wp.vec4],  # [N,I]
+    slot_cone: wp.array2d[wp.vec4],  # [N,I]
     near: wp.array2d[float],  # [N,I]
     kind: wp.array2d[int],
     size: wp.array2d[wp.vec3],
@@ -332,19 +338,16 @@ def cull_bundles(
     sin_half = wp.sqrt(wp.max(1.0 - cos_half * cos_half, 0.0))
     num = int(0)
     for s in range(count[env]):
-        s4 = sphere[env, s]
-        c = wp.vec3(s4[0], s4[1], s4[2])
-        r = s4[3]
-        along = wp.dot(c, axis)
-        # The line's distance is a lower bound of the cone's; behind the apex a half space is the better one.
-        if cos_half < 0.0 or along > -r:
-            aside = wp.sqrt(wp.max(wp.length_sq(c) - along * along, 0.0))
-            touches = aside * cos_half - along * sin_half <= r
-            if touches and cos_half > 0.0:
-                local = rot[env, s] * axis
-                touches = not is_leaving(kind[env, s], origin[env, s], size[env, s], local, cos_half, sin_half)
-            if touches:
-                key = near[env, s]
+        s4 = slot_cone[env, s]
+        # Two cones with one apex meet where the angle between their axes is at most the sum of their half angles.
+        together = cos_half * s4[3] - sin_half * wp.sqrt(wp.max(1.0 - s4[3] * s4[3], 0.0))
+        key = near[env, s]
+        if key <= 0.0 or c4[0] * s4[0] + c4[1] * s4[1] + c4[2] * s4[2] >= together - 1.0e-5 or cos_half < 0.0:
+            local = rot[env, s] * axis
+            leaving = cos_half > 0.0 and is_leaving(
+                kind[env, s], origin[env, s], size[env, s], local, cos_half, sin_half
+            )
+            if not leaving:
                 j = int(num)
                 while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
                     cand_out[env, g, j] = cand_out[env, g, j - 1]
@@ -398,7 +401,6 @@ def trace_rays(
             break
         s4 = sphere[env, s]
         centre = wp.vec3(s4[0], s4[1], s4[2])
-        radius_sq = s4[3] * s4[3]
         inst = slot_inst[env, s]
         shape = kind[env, s]
         R_IS = rot[env, s]
@@ -411,8 +413,8 @@ def trace_rays(
             best = range_out[env, out]
             if start <= best:
                 d = direction[row, k]
-                aside = centre - wp.dot(centre, d) * d
-                if wp.dot(aside, aside) <= radius_sq:
+                along = wp.dot(centre, d)
+                if s4[3] <= 0.0 or (along > 0.0 and along * along >= s4[3]):
                     t = ray_instance(shape, o, R_IS * d, extent, mesh_id, best)
                     if t < best:
                         best = t

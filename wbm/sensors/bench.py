@@ -21,7 +21,7 @@ from wbm.sensors.oracle import MujocoScene
 from wbm.sensors.ray_sensor import RaySensor
 from wbm.sensors.scene import Instances, RayScene
 
-SIZES = (32, 56, 128, 256)
+SIZES = (48, 56, 128, 256)
 NUM_MESHES = 4
 SILHOUETTE = 1e-6  # rad; a float32 direction is worth about 1e-7
 TOLERANCE = 1e-4  # m

@@ -104,7 +104,7 @@ class RaySensor:
         self._inst, self._kind = new(slots, wp.int32), new(slots, wp.int32)
         self._size, self._mesh = new(slots, wp.vec3), new(slots, wp.uint64)
         self._rot, self._origin = new(slots, wp.mat33), new(slots, wp.vec3)
-        self._sphere, self._near = new(slots, wp.vec4), new(slots, wp.float32)
+        self._sphere, self._slot_cone, self._near = new(slots, wp.vec4), new(slots, wp.vec4), new(slots, wp.float32)
         self._cand_count, self._cand = new(bundles, wp.int32), new((*bundles, slots[1]), wp.int16)
         self.true_range, self.true_instance = new(hits, wp.float32), new(hits, wp.int32)
         self.range, self.depth = new(hits, wp.float32), new(hits, wp.float32)
@@ -162,7 +162,7 @@ class RaySensor:
             ],
             outputs=[
                 self.ok, self._count, self._inst, self._kind, self._size, self._mesh, self._rot, self._origin,
-                self._sphere, self._near,
+                self._sphere, self._slot_cone, self._near,
             ],
             device=device,
         )  # fmt: skip
@@ -170,8 +170,8 @@ class RaySensor:
             cull_bundles,
             dim=(num, self._cand_count.shape[1]),
             inputs=[
-                ids, self.pattern, self._cone, self._count, self._sphere, self._near, self._kind, self._size, self._rot,
-                self._origin,
+                ids, self.pattern, self._cone, self._count, self._slot_cone, self._near, self._kind, self._size,
+                self._rot, self._origin,
             ],
             outputs=[self._cand_count, self._cand],
             device=device,
@@ -190,9 +190,9 @@ class RaySensor:
 
     @property
     def placed(self) -> tuple[wp.array, ...]:
-        """Instances as the last `trace` listed them for each environment: count [N], kind, size, mesh, rotation and
-        origin in the instance's frame, bounding sphere in the sensor's (all [N,I])."""
-        return self._count, self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere
+        """Instances as the last `trace` listed them: count [N]; kind, size, mesh, rotation and origin in the instance's
+        frame, bounding sphere in the sensor's and its nearest range [N,I]."""
+        return self._count, self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near
 
     def fill(self, ids: wp.array) -> None:
         """Apply the noise and derive depth, ids, colour, flags and points of the given environments."""
