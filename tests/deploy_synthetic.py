@@ -23,7 +23,9 @@ def weights(seed: int = 0) -> dict[str, np.ndarray]:
     """One matrix [width, 32] a field: the synthetic policy is tanh of a sum of linear maps."""
     rng = np.random.default_rng(seed)
     return {
-        f.name: (rng.normal(size=(int(np.prod(f.shape)), 32)) * (1e-4 if f.name == "depth_rgb" else 0.02)).astype(np.float32)
+        f.name: (rng.normal(size=(int(np.prod(f.shape)), 32)) * (1e-4 if f.name == "depth_rgb" else 0.02)).astype(
+            np.float32
+        )
         for f in SCHEMA.observation
     }
 
@@ -80,7 +82,9 @@ def make_bundle(path, seed: int = 0, gain: float = 1.0, cfg: DeployConfig | None
     rng = np.random.default_rng(7)
     arguments = {
         "onnx": onnx_model(maps, gain),
-        "contract": make_contract(load_robot(), SCHEMA, cfg, "synthetic", {"proprio": (np.zeros(NUM_PROPRIO), np.ones(NUM_PROPRIO))}),
+        "contract": make_contract(
+            load_robot(), SCHEMA, cfg, "synthetic", {"proprio": (np.zeros(NUM_PROPRIO), np.ones(NUM_PROPRIO))}
+        ),
         "golden_inputs": inputs,
         "golden_action": forward(inputs, maps),
         "instructions": InstructionCache({s: rng.normal(size=8) for s in SENTENCES}, 8),

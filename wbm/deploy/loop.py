@@ -54,7 +54,9 @@ def timing_summary(compute_s: np.ndarray, start_s: np.ndarray) -> dict[str, floa
     }
 
 
-def run_loop(driver: Driver, runtime: PolicyRuntime, steps: int, log: RunLog | None = None, max_refusals: int = 25) -> LoopReport:
+def run_loop(
+    driver: Driver, runtime: PolicyRuntime, steps: int, log: RunLog | None = None, max_refusals: int = 25
+) -> LoopReport:
     """Run the policy in closed loop.
 
     A refusal never reaches the driver as a command: the driver is told to hold, and the loop goes on with the next reading.

@@ -9,7 +9,7 @@ import numpy as np
 from wbm.deploy.bundle import Bundle
 from wbm.deploy.driver import Command, Reading
 from wbm.deploy.faults import Fault, Refused
-from wbm.deploy.kinematics import Kinematics, proprioception
+from wbm.deploy.kinematics import Kinematics
 from wbm.deploy.safety import SafetyFilter
 from wbm.robot import joints
 from wbm.robot.schema import to_target
@@ -121,7 +121,7 @@ class PolicyRuntime:
             "depth_target": reading.depth_target.astype(np.uint8),
             "lidar_xyz": to_base("lidar", "lidar", reading.lidar_xyz, reading.lidar_valid),
             "lidar_valid": reading.lidar_valid.astype(np.uint8),
-            "proprio": proprioception(q, np.asarray(reading.qd, dtype=np.float64), frames),
+            "proprio": self._kinematics.proprio(q, np.asarray(reading.qd, dtype=np.float64), frames),
             "prev_action": self._previous,
             "text": self._text,
         }
@@ -134,4 +134,7 @@ class PolicyRuntime:
                 raise Refused(Fault.WORKSPACE, f"the target puts {name} at height {frames[name][1][2]:.3f} m")
         reach = float(np.linalg.norm((frames["ee"][1] - frames["base"][1])[:2]))
         if reach > limits["reach_m"]:
-            raise Refused(Fault.WORKSPACE, f"the target puts the grasp centre {reach:.2f} m from the base, allowed {limits['reach_m']:.2f} m")
+            raise Refused(
+                Fault.WORKSPACE,
+                f"the target puts the grasp centre {reach:.2f} m from the base, allowed {limits['reach_m']:.2f} m",
+            )
