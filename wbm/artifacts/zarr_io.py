@@ -70,7 +70,6 @@ def create(folder: Path, arrays: Mapping[str, ArraySpec], attrs: Mapping[str, An
             compressors=BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.shuffle),
             fill_value=0,
             attributes=dict(spec.attrs or {}),
-            config={"write_empty_chunks": True},
         )
     return group
 
@@ -88,7 +87,7 @@ def write_shard(group: zarr.Group, index: int, data: Mapping[str, np.ndarray]) -
         stop = min(start + array.shards[0], array.shape[0])
         if values.shape != (stop - start, *array.shape[1:]):
             raise ValueError(f"{name}: shard {index} has shape {(stop - start, *array.shape[1:])}, got {values.shape}")
-        array[start:stop] = values
+        array.with_config({"write_empty_chunks": True})[start:stop] = values  # the setting is not stored in the group
     fsync_group(group)
 
 

@@ -160,6 +160,9 @@ class EnvConfig:
         reach_radius: the object is out of reach beyond this horizontal distance from its settled place, m.
         drop_height: a lifted object below this height that is not held has been dropped, m.
         max_hand_force: hand force on supports or distractors that is a forbidden collision, N.
+        fall_height: the object is out of reach this far below its settled height, m.
+        finish_s: end the episode with success after holding this long in a row, s; 0 plays every episode to its end.
+        end_on_collision: end the episode at the first forbidden contact; else it is judged at the end.
         max_speed: object speed that means the physics is unstable, m/s.
         starts_per_scene: pre-grasp solutions kept for each scene.
     """
@@ -174,6 +177,9 @@ class EnvConfig:
     reach_radius: float = 0.35
     drop_height: float = 0.03
     max_hand_force: float = 60.0
+    fall_height: float = 0.10
+    finish_s: float = 0.0
+    end_on_collision: bool = True
     max_speed: float = 15.0
     starts_per_scene: int = 8
     action: ActionConfig = field(default_factory=ActionConfig)
@@ -187,5 +193,7 @@ class EnvConfig:
             raise ValueError(f"env.pregrasp_share must be within 0 and 1, not {self.pregrasp_share}")
         if self.episode_s <= self.success_hold_s:
             raise ValueError(f"env.episode_s ({self.episode_s}) must exceed env.success_hold_s ({self.success_hold_s})")
+        if 0 < self.finish_s < self.success_hold_s:
+            raise ValueError(f"env.finish_s ({self.finish_s}) must be 0 or at least env.success_hold_s")
         if self.starts_per_scene < 1:
             raise ValueError(f"env.starts_per_scene must be at least 1, not {self.starts_per_scene}")
