@@ -17,6 +17,7 @@ class ActionConfig:
         ee_turn: the same for rotation, rad a step.
         ee_leash: the target stays within this distance of the hand, m.
         ee_turn_leash: the same for rotation, rad.
+        feed_forward: share of the target's own velocity that the controller is told.
         hand_step: hand joint motion at an action of 1, rad a step, for each joint's own value.
         closure_step: the same for the common closure.
         finger_step: the same for a finger's closure.
@@ -33,6 +34,7 @@ class ActionConfig:
     ee_turn: float = 0.06
     ee_leash: float = 0.06
     ee_turn_leash: float = 0.35
+    feed_forward: float = 0.8
     hand_step: float = 0.06
     closure_step: float = 0.10
     finger_step: float = 0.08
