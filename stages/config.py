@@ -15,6 +15,8 @@ from wbm.envs.rollout_config import RolloutsConfig
 from wbm.learning.config import PpoConfig, TeacherConfig
 from wbm.learning.student_config import DistillConfig, StudentConfig
 from wbm.report.config import EvaluationConfig
+from wbm.control.config import WbcConfig
+from wbm.robot.config import MjcfOptions
 from wbm.scenes.config import ObjectsConfig, ScenesConfig
 from wbm.sensors.config import SensorsConfig
 from wbm.sim.config import SimConfig
@@ -40,6 +42,8 @@ class Config:
     inputs: dict[str, str] = field(default_factory=dict)
     teachers: tuple[str, ...] = ("top_down", "side")
     artifacts: ArtifactsConfig = field(default_factory=ArtifactsConfig)
+    robot: MjcfOptions = field(default_factory=MjcfOptions)
+    wbc: WbcConfig = field(default_factory=WbcConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     scenes: ScenesConfig = field(default_factory=ScenesConfig)
     sim: SimConfig = field(default_factory=SimConfig)
