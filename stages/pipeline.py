@@ -24,8 +24,11 @@ class StageError(Exception):
     """A stage failed; the message says which, why, and where its output is."""
 
 
-class Interrupted(Exception):
-    """The user or the scheduler asked the run to stop; what is finished is kept."""
+class Interrupted(BaseException):
+    """The user or the scheduler asked the run to stop; what is finished is kept.
+
+    No `Exception`, so that a stage that catches those does not swallow it.
+    """
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from wbm.artifacts.errors import ArtifactError, Conflict, Missing
 from wbm.artifacts.lease import acquire
 from wbm.artifacts.store import Store
 
-
 RACERS = 64 if os.environ.get("WBM_FULL") else 16
 
 

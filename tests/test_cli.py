@@ -256,6 +256,30 @@ def test_why_diff_and_repro_diff(root):
     assert used[0]["artifact"].startswith("student/main") and used[0]["branches"][0]["slot"] == "policy"
 
 
+MAKEFILE = """
+WBM := {python} -m toy
+WBM_ARGS = {settings}
+WBM_ROOT := store
+include {repository}/wbm.mk
+paper.txt: $(call wbm_latest,student/main)
+\tdate +%N > $@
+"""
+
+
+def test_another_makefile_builds_only_what_changed(tmp_path):
+    def make(target, settings="seed=0"):
+        text = MAKEFILE.format(python=sys.executable, repository=REPOSITORY, settings=settings)
+        (tmp_path / "Makefile").write_text(text)
+        done = subprocess.run(["make", "-s", target], cwd=tmp_path, env=ENV, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return (tmp_path / "paper.txt").read_text() if target == "paper.txt" else done.stdout
+
+    first = make("paper.txt")
+    assert make("paper.txt") == first, "nothing changed"
+    assert make("paper.txt", "seed=0 teachers=[side]") != first, "the student is another one"
+    assert "up to date" in make("assets")
+
+
 def test_help_imports_nothing_heavy():
     code = "import sys; from stages.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
     code += "heavy = ('torch', 'warp', 'mujoco', 'hydra', 'zarr', 'numpy', 'rich')\n"
