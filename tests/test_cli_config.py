@@ -21,7 +21,7 @@ from wbm.artifacts.store import Store
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 ENV = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-LINES = 500 if os.environ.get("WBM_FULL") else 24
+LINES = 500 if os.environ.get("WBM_FULL") else 12
 
 
 def override_line(rng):
