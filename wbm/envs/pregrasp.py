@@ -17,7 +17,7 @@ from wbm.envs.binding import SceneTable
 from wbm.envs.config import EnvConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.randomization import scaled
-from wbm.envs.rotations import quat_exp, quat_log, quat_conj, quat_mul, quat_to_mat, rotate
+from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, quat_to_mat, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
@@ -41,7 +41,6 @@ class StartBank:
     def usable(self) -> Tensor:
         """Indices of the scenes that have a start."""
         return self.count.nonzero().squeeze(1)
-
 
 
 def grasp_poses(table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -123,7 +122,9 @@ def solve_starts(
                     bank[scene, found[scene]] = row
                     found[scene] += 1
     if int(found.max()) == 0:
-        raise ValueError(f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff")
+        raise ValueError(
+            f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff"
+        )
     return StartBank(bank, found)
 
 
