@@ -11,22 +11,18 @@ from wbm.control.config import WbcConfig
 from wbm.control.wbc import WholeBodyController
 from wbm.envs import rewards
 from wbm.envs.actions import make_action
-from wbm.envs.approach import Approach
 from wbm.envs.binding import SceneBinding
-from wbm.envs.config import EnvConfig, Range
+from wbm.envs.config import EnvConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.observations import TeacherObservation
-from wbm.envs.outcome import RUNNING, UNSTABLE, Outcome
+from wbm.envs.outcome import RUNNING, TIMEOUT, UNSTABLE, Outcome
 from wbm.envs.pregrasp import StartBank
-from wbm.envs.randomization import Randomizer, scaled
+from wbm.envs.randomization import Randomizer
 from wbm.envs.sensing import StateReader
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 from wbm.sim.config import SimConfig
 from wbm.sim.simulation import make_simulation
-
-ARRIVAL_GAP, ARRIVAL_TURN = 0.025, 0.2  # m and rad within which the teacher takes over
-STATE = ("_reference_pos", "episode", "scene", "elapsed", "handover", "contact", "ctrl", "previous", "posture")
 
 
 class GraspEnv:
@@ -40,9 +36,8 @@ class GraspEnv:
         state: the present `GraspState`.
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
+        phase: 0 free space, 1 contact-rich [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
-        contact: whether the teacher acts [N]; before that, in whole-body episodes, the controller approaches.
-        handover: value of `elapsed` when the teacher took over [N].
     """
 
     def __init__(
@@ -60,8 +55,7 @@ class GraspEnv:
         self.cfg, self.robot, self.binding, self.starts = cfg, robot, binding, starts
         self.num_envs, self.seed, self.device = num_envs, seed, device
         self.period, self.decimation = sim_cfg.period, sim_cfg.decimation
-        self.contact_steps = round(cfg.episode_s / self.period)
-        self.approach_steps = round(cfg.approach_s / self.period)
+        self.max_steps = round(cfg.episode_s / self.period)
         self.sim = make_simulation(binding.model, num_envs, sim_cfg, device)
         self.controller = WholeBodyController(robot, num_envs, binding.table.obstacle_type.shape[1], wbc_cfg, device)
         self._wire_controller()
@@ -70,28 +64,28 @@ class GraspEnv:
         self._pick = self.columns.add("scene")
         self._start = self.columns.add("start")
         self._hand = self.columns.add("start_hand", 16)
-        self._arm = self.columns.add("start_arm", 7)
-        self._share = self.columns.add("pregrasp_share")
         self.action = make_action(cfg.action, robot, num_envs, self.period, device)
         self.observe = TeacherObservation(robot, self.action.offset_labels, self.action.labels, device)
         self.reader = StateReader(robot, self.sim, self.controller, binding, cfg, self.period)
-        self.approach = Approach(robot, num_envs, self.period, device)
         self.outcome = Outcome(cfg, self.period, num_envs, device)
         self.episode = torch.full((num_envs,), -1, dtype=torch.int64, device=device)
         self.scene = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.elapsed = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        self.handover = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        self.contact = torch.ones(num_envs, dtype=torch.bool, device=device)
-        self._contact_limit = self.contact_steps
-        if cfg.start == "whole_body" and cfg.action.term == "joint":
-            self._contact_limit += self.approach_steps
-        self._q_min = torch.tensor(robot.q_min, dtype=torch.float32, device=device)
-        self._q_max = torch.tensor(robot.q_max, dtype=torch.float32, device=device)
-        self._reference_pos = torch.zeros(num_envs, 3, device=device)
         self.ctrl = self.sim.ctrl.clone()
         self.noise: Tensor | None = None
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
         self.next_episode = 0
+        self.phase = torch.ones(num_envs, dtype=torch.uint8, device=device)
+
+    @property
+    def limit_steps(self) -> int:
+        """Policy steps after which an episode ends in any case."""
+        return self.max_steps
+
+    def object_poses(self) -> Tensor:
+        """World poses of target and distractors [N,1+D,7], position and quaternion (w x y z)."""
+        first, count = self.binding.target_qpos.start, 1 + self.binding.num_distractors
+        return self.sim.qpos[:, first : first + 7 * count].view(self.num_envs, count, 7)
 
     @property
     def num_actions(self) -> int:
@@ -127,14 +121,8 @@ class GraspEnv:
 
     def _live(self) -> dict[str, Tensor]:
         """The environment's own state tensors by name."""
-        own = {name: getattr(self, name) for name in STATE}
-        parts = {
-            "action": self.action,
-            "hand": self.action.hand,
-            "approach": self.approach,
-            "outcome": self.outcome,
-            "reader": self.reader,
-        }
+        own = {name: getattr(self, name) for name in ("episode", "scene", "elapsed", "ctrl", "previous", "posture")}
+        parts = {"action": self.action, "hand": self.action.hand, "outcome": self.outcome, "reader": self.reader}
         for part, item in parts.items():
             own |= {f"{part}.{name}": value for name, value in vars(item).items() if name in item.STATE}
         return own | {f"controller.{name}": tensor for name, tensor in self._controller_state.items()}
@@ -158,21 +146,13 @@ class GraspEnv:
             scenes = (u[:, self._pick].squeeze(1) * table.count).long().clamp_(max=table.count - 1)
         else:
             scenes = torch.from_numpy(episodes % table.count).to(self.device)
-        goal = self.starts.draw(scenes, u[:, self._start].squeeze(1))
-        self._jitter(goal[:, joints.HAND], self.cfg.randomization.start_hand, u[:, self._hand])
-        q, away = goal.clone(), self._starts_away(u[:, self._share].squeeze(1))
-        if bool(away.any()):
-            q[away] = table.q_start[scenes[away]]
-            q[away, joints.HAND] = goal[away, joints.HAND]
-            arm = q[:, joints.ARM].clone()
-            self._jitter(arm, self.cfg.randomization.start_arm, u[:, self._arm])
-            q[:, joints.ARM] = torch.where(away.unsqueeze(1), arm, q[:, joints.ARM])
-        q = torch.maximum(torch.minimum(q, self._q_max), self._q_min)
+        q = self._start_joints(ids, scenes, u)
+        hand = self.cfg.randomization.start_hand
+        if hand.on:
+            q[:, joints.HAND] += hand.low + (hand.high - hand.low) * u[:, self._hand]
+            q[:, joints.HAND] = torch.maximum(torch.minimum(q[:, joints.HAND], self.action.hand.high), self.action.hand.low)
         self.episode[ids] = torch.from_numpy(episodes).to(self.device)
-        self.scene[ids], self.elapsed[ids], self.handover[ids] = scenes, 0, 0
-        # In joint space the policy does everything itself, the way to the object included.
-        self.contact[ids] = ~away if self.cfg.action.term == "wbc" else torch.ones_like(away)
-        self.approach.begin(ids, q, goal)
+        self.scene[ids], self.elapsed[ids] = scenes, 0
         self._load_physics(ids, u, scenes)
         self.sim.qpos[ids, : joints.NUM_JOINTS] = q
         self.sim.qvel[ids] = 0.0
@@ -189,18 +169,18 @@ class GraspEnv:
         self.controller.forward_kinematics()
         ee = self.reader.ee
         self.action.reset(ids, q, self.frame_pos[ids, ee], self.frame_quat[ids, ee])
-        self._reference_pos[ids] = self.frame_pos[ids, ee]
 
-    def _starts_away(self, u: Tensor) -> Tensor:
-        """Which of K episodes start away from the support, by uniforms [K]."""
-        if self.cfg.start == "local":
-            return torch.zeros_like(u, dtype=torch.bool)
-        return u >= self.cfg.pregrasp_share
+    def _start_joints(self, ids: Tensor, scenes: Tensor, u: Tensor) -> Tensor:
+        """Joint positions [K,32] in which the episodes of environments `ids` start."""
+        return self.starts.draw(scenes, u[:, self._start].squeeze(1))
 
-    @staticmethod
-    def _jitter(q: Tensor, item: Range, u: Tensor) -> None:
-        if item.on:
-            q += scaled(item, u)
+    def _contact_steps(self) -> Tensor:
+        """Policy steps [N] since the contact-rich phase began."""
+        return self.elapsed
+
+    def _time_up(self) -> Tensor:
+        """Episodes [N] whose time has run out."""
+        return self.elapsed >= self.max_steps
 
     # Steps
 
@@ -210,93 +190,70 @@ class GraspEnv:
         Returns:
             The observation [N,O] (of the next episode where one ended), rewards [N], done flags [N] and a dictionary:
             `time_outs` [N] (ended by time alone), `outcome` [N] (see `outcome.REASONS`, `RUNNING` where it goes on),
-            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step belonged to.
+            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step belonged to,
+            `ctrl` [N,32] clean joint targets, and `ended`, what the step led to before any restart: `held`, `height`,
+            `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
         """
         action = action.clamp(-self.cfg.action.limit, self.cfg.action.limit)
         s = self.state
         self.action.apply(action, s.q, s.ee_pos_w, s.ee_quat)
-        if self.cfg.action.term == "joint":
-            self.ctrl[:, self._body] = self.action.target
-            self.ctrl[:, joints.HAND] = self.action.hand.target
-        else:
-            self._command()
-        return self._advance(action, self.approach_steps)
+        self._command()
+        return self._advance(action)
 
     def step_targets(self, ctrl: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
-        """One policy step with joint targets [N,32] in place of the controller's; returns what `step` does.
-
-        Whoever commands the joints does the whole episode, so that it ends after approach and contact time together.
-        """
+        """One policy step with joint targets [N,32] in place of the controller's; returns what `step` does."""
         self.ctrl.copy_(ctrl)
-        return self._advance(torch.zeros_like(self.previous), self.approach_steps + self.contact_steps)
+        return self._advance(torch.zeros_like(self.previous))
 
     def _command(self) -> None:
-        """Fill `ctrl`: the controller tracks the action's target, or the approach's reference where that is not over."""
+        """Fill `ctrl` from the action term, through the controller unless the term is in joint space."""
         term, s = self.action, self.state
+        self.ctrl[:, joints.HAND] = term.hand.target
+        if self.cfg.action.term == "joint":
+            self.ctrl[:, self._body] = term.target
+            return
+        self.ee_velocity.copy_(term.velocity)
         self.ee_target.copy_(term.pos)
         self.ee_target_quat.copy_(term.quat)
-        self.ee_velocity.copy_(term.velocity)
-        self.ctrl[:, joints.HAND] = term.hand.target
-        if not bool(self.contact.all()):
-            self._follow_approach()
         self.gaze.copy_(s.obj_pos_w)
-        self.q_in.copy_(s.q)
         self.controller.step()
         self.ctrl[:, self._body] = self.body_ctrl
         if self.cfg.action.neck == "fixed":
             self.ctrl[:, joints.NECK] = self.posture[:, -6:]
 
-    def _follow_approach(self) -> None:
-        """Targets of the environments that still approach; hands over where the pre-grasp is reached."""
-        s, away = self.state, ~self.contact
-        before = self._reference_pos
-        reference = self.approach.advance((before - s.ee_pos_w).norm(dim=-1))
-        self.q_in.copy_(reference)
-        self.controller.forward_kinematics()
-        pos, quat = self.frame_pos[:, self.reader.ee], self.frame_quat[:, self.reader.ee]
-        gap = (pos - s.ee_pos_w).norm(dim=-1)
-        turn = 2 * torch.arccos((quat * s.ee_quat).sum(-1).abs().clamp(max=1.0))
-        arrived = away & (self.approach.share >= 1.0) & (gap < ARRIVAL_GAP) & (turn < ARRIVAL_TURN)
-        mask = away.unsqueeze(1)
-        self.ee_velocity.copy_(torch.where(mask, (pos - before) / self.period, self.ee_velocity))
-        self.ee_target.copy_(torch.where(mask, pos, self.ee_target))
-        self.ee_target_quat.copy_(torch.where(mask, quat, self.ee_target_quat))
-        self.posture.copy_(torch.where(mask, reference[:, self._body], self.posture))
-        self.ctrl[:, joints.HAND] = torch.where(mask, reference[:, joints.HAND], self.ctrl[:, joints.HAND])
-        self._reference_pos = pos.clone()
-        ids = arrived.nonzero().squeeze(1)
-        self.contact[ids] = True
-        self.handover[ids] = self.elapsed[ids]
-        self.action.reset(ids, s.q[ids], s.ee_pos_w[ids], s.ee_quat[ids])
-        self.previous[ids] = 0.0
-
-    def _advance(self, action: Tensor, approach_limit: int) -> tuple[Tensor, Tensor, Tensor, dict]:
+    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
         self.sim.ctrl.copy_(self.ctrl if self.noise is None else self.ctrl + self.noise)
         self.sim.step(self.decimation)
         self.elapsed += 1
         self._refresh()
         reward, terms = rewards.total(self.state, action, self.previous, self.cfg.reward)
         self.previous.copy_(action)
-        spent = self.elapsed - self.handover
-        time_up = torch.where(self.contact, spent >= self._contact_limit, spent >= approach_limit)
+        time_up = self._time_up()
         code = self.outcome.update(self.state, self.reader.start_pos, time_up)
         done = code != RUNNING
         timed = done & time_up
         reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed)
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
+        info |= {"ctrl": self.ctrl.clone(), "ended": self._ended()}
         ids = done.nonzero().squeeze(1)
         if len(ids):
             self._begin(ids)
             self._refresh()
         return self.obs, reward, done, info
 
+    def _ended(self) -> dict[str, Tensor]:
+        s = self.state
+        force = s.finger_force.amax(1)
+        z = self.object_poses()[:, :, 2].clone()
+        return {"held": s.held, "height": s.height, "force": force, "forbidden": s.forbidden, "object_z": z}
+
     def _refresh(self) -> None:
         """Recompute frames, state and observation from the simulation."""
         self.q_in.copy_(self.sim.qpos[:, : joints.NUM_JOINTS])
         self.controller.forward_kinematics()
         self.state = s = self.reader.read(self.frame_pos, self.frame_quat)
-        time = (self.elapsed - self.handover) * self.contact / self._contact_limit
+        time = self._contact_steps() / self.max_steps
         offset = self.action.offset(s.q, s.ee_pos_w, s.ee_quat)
         self.obs = self.observe(
             s, self.ctrl[:, joints.HAND], self.reader.support, self.min_distance, time, offset, self.previous
