@@ -6,8 +6,10 @@ against their bound, takes the Newton step of the others (Cholesky of at most 16
 makes the matrix stiff), projects it onto the box and halves it until the function falls (Bertsekas, 1982).
 """
 
-# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
+
+from wbm.kernels.kinematics import Tree
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,6 +22,7 @@ ONE = wp.constant(wp.float64(1.0))
 HALF = wp.constant(wp.float64(0.5))
 PIVOT = wp.constant(wp.float64(1.0e-9))
 DESCENT = wp.constant(wp.float64(1.0e-4))
+HALVINGS = wp.constant(6)
 TOLERANCE = wp.constant(wp.float64(1.0e-7))
 """Largest gradient of a free joint at which the iteration ends; with damping 1e-2 velocities are then exact to 1e-5."""
 
@@ -45,6 +48,27 @@ def task_hessian(
     for i in range(n):
         hessian[i, i] += wp.max(wp.float64(diag[e, i]), wp.float64(1.0e-6))
     return hessian
+
+
+@wp.func
+def task_linear(
+    e: int,
+    n: int,
+    jac: wp.array3d(dtype=wp.float32),
+    vel: wp.array2d(dtype=wp.float32),
+    weight: wp.array2d(dtype=wp.float32),
+    rhs: wp.array2d(dtype=wp.float32),
+) -> vec16:
+    """`sum_r w_r J_r^T v_r + g`."""
+    linear = vec16()
+    for i in range(n):
+        linear[i] = wp.float64(rhs[e, i])
+    for r in range(jac.shape[1]):
+        s = wp.float64(weight[e, r]) * wp.float64(vel[e, r])
+        if s != ZERO:
+            for i in range(n):
+                linear[i] += s * wp.float64(jac[e, r, i])
+    return linear
 
 
 @wp.func
@@ -85,29 +109,80 @@ def cholesky_solve(matrix: mat16, rhs: vec16, n: int) -> vec16:
     return y
 
 
+@wp.struct
+class Dampers:
+    """Collision rows `n^T J x + s >= b`, kept as candidates: the row itself is written out only where it acts."""
+
+    region_start: wp.array(dtype=wp.int32)  # [G+2]
+    count: wp.array2d(dtype=wp.int32)  # [N,G+1]
+    force: wp.array2d(dtype=wp.vec3)  # [N,C]
+    moment: wp.array2d(dtype=wp.vec3)  # [N,C]
+    bound: wp.array2d(dtype=wp.float32)  # [N,C]
+    side: wp.array2d(dtype=wp.vec2i)  # [N,C]
+    screw: wp.array2d(dtype=wp.spatial_vector)  # [N,J]
+
+
+@wp.func
+def damper_entry(tree: Tree, screw: wp.spatial_vector, moment: wp.vec3, force: wp.vec3, side: wp.vec2i, j: int) -> wp.float64:
+    """`dd/dq_j`: the speed of a pair's distance for unit velocity of joint j."""
+    sign = (tree.group_mask[side[0]] >> j) & 1
+    if side[1] >= 0:
+        sign -= (tree.group_mask[side[1]] >> j) & 1
+    entry = ZERO
+    if sign != 0:
+        entry = wp.float64(float(sign) * (wp.dot(wp.spatial_top(screw), moment) + wp.dot(wp.spatial_bottom(screw), force)))
+    return entry
+
+
+@wp.func
+def group_twists(
+    e: int, tree: Tree, screw: wp.array2d(dtype=wp.spatial_vector), x: vec16, twist_out: wp.array2d(dtype=wp.spatial_vectord)
+):
+    """Twist of every group of spheres at the joint velocities x, along the tree."""
+    for g in range(tree.group_parent.shape[0]):
+        twist = wp.spatial_vectord()
+        if tree.group_parent[g] >= 0:
+            twist = twist_out[e, tree.group_parent[g]]
+        for i in range(tree.group_own[g], tree.group_own[g + 1]):
+            j = tree.group_joint[i]
+            twist += x[j] * wp.spatial_vectord(screw[e, j])
+        twist_out[e, g] = twist
+
+
+@wp.func
+def damper_lack(e: int, i: int, dampers: Dampers, twist: wp.array2d(dtype=wp.spatial_vectord)) -> wp.float64:
+    """`b_i - A_i x` of candidate i, with x in the form of the groups' twists."""
+    side = dampers.side[e, i]
+    v = twist[e, side[0]]
+    if side[1] >= 0:
+        v -= twist[e, side[1]]
+    m = dampers.moment[e, i]
+    f = dampers.force[e, i]
+    speed = v[0] * wp.float64(m[0]) + v[1] * wp.float64(m[1]) + v[2] * wp.float64(m[2])
+    speed += v[3] * wp.float64(f[0]) + v[4] * wp.float64(f[1]) + v[5] * wp.float64(f[2])
+    return wp.float64(dampers.bound[e, i]) - speed
+
+
 @wp.func
 def damper_cost(
-    e: int,
-    n: int,
-    rows: wp.array(dtype=wp.int32),
-    row: wp.array3d(dtype=wp.float32),
-    bound: wp.array2d(dtype=wp.float32),
-    x: vec16,
+    e: int, tree: Tree, dampers: Dampers, x: vec16, twist_out: wp.array2d(dtype=wp.spatial_vectord)
 ) -> wp.float64:
-    """`sum_k max(0, b_k - A_k x)^2`."""
+    """`sum_k max(0, b_k - A_k x)^2`; leaves the groups' twists at x behind."""
+    group_twists(e, tree, dampers.screw, x, twist_out)
     cost = ZERO
-    for k in range(rows[e]):
-        lack = wp.float64(bound[e, k])
-        for i in range(n):
-            lack -= wp.float64(row[e, k, i]) * x[i]
-        if lack > ZERO:
-            cost += lack * lack
+    for g in range(dampers.count.shape[1]):
+        start = dampers.region_start[g]
+        for i in range(start, start + dampers.count[e, g]):
+            lack = damper_lack(e, i, dampers, twist_out)
+            if lack > ZERO:
+                cost += lack * lack
     return cost
 
 
 @wp.kernel(enable_backward=False)
 def solve_qp(
     # in:
+    tree: Tree,
     jac: wp.array3d(dtype=wp.float32),  # [N,9,J]
     vel: wp.array2d(dtype=wp.float32),  # [N,9]
     weight: wp.array2d(dtype=wp.float32),  # [N,9]
@@ -115,47 +190,50 @@ def solve_qp(
     rhs: wp.array2d(dtype=wp.float32),  # [N,J]
     low: wp.array2d(dtype=wp.float64),  # [N,J]
     high: wp.array2d(dtype=wp.float64),  # [N,J]
-    rows: wp.array(dtype=wp.int32),  # [N]
-    row: wp.array3d(dtype=wp.float32),  # [N,K,J]
-    bound: wp.array2d(dtype=wp.float32),  # [N,K]
+    dampers: Dampers,
+    nearest: wp.array2d(dtype=wp.float32),  # [N,G+1]
     slack_weight: wp.float64,  # rho
     iterations: wp.int32,
     qd_start: wp.array2d(dtype=wp.float32),  # [N,J]
     # out:
+    twist_out: wp.array2d(dtype=wp.spatial_vectord),  # [N,G] scratch
     x_out: wp.array2d(dtype=wp.float64),  # [N,J]
     iterations_out: wp.array(dtype=wp.int32),  # [N]
+    min_distance_out: wp.array(dtype=wp.float32),  # [N]
 ):
     """Joint velocities that minimise the program, within the box exactly."""
     e = wp.tid()
     n = low.shape[1]
     hessian = task_hessian(e, n, jac, weight, diag)
-    linear = vec16()
+    linear = task_linear(e, n, jac, vel, weight, rhs)
     x = vec16()
     for i in range(n):
-        s = wp.float64(rhs[e, i])
-        for r in range(jac.shape[1]):
-            s += wp.float64(weight[e, r]) * wp.float64(vel[e, r]) * wp.float64(jac[e, r, i])
-        linear[i] = s
         x[i] = wp.clamp(wp.float64(qd_start[e, i]), low[e, i], high[e, i])
     smooth = gradient_of(hessian, linear, x, n)
-    cost = HALF * (wp.dot(x, smooth) - wp.dot(x, linear)) + HALF * slack_weight * damper_cost(e, n, rows, row, bound, x)
+    cost = HALF * (wp.dot(x, smooth) - wp.dot(x, linear))
+    cost += HALF * slack_weight * damper_cost(e, tree, dampers, x, twist_out)
     done = int(0)
     used = int(0)
     while done == 0 and used < iterations:
         used += 1
         gradient = smooth
         matrix = hessian
-        for k in range(rows[e]):
-            lack = wp.float64(bound[e, k])
-            for i in range(n):
-                lack -= wp.float64(row[e, k, i]) * x[i]
-            if lack > ZERO:
-                for i in range(n):
-                    a = slack_weight * wp.float64(row[e, k, i])
-                    if a != ZERO:
-                        gradient[i] -= lack * a
-                        for j in range(i, n):
-                            matrix[i, j] += a * wp.float64(row[e, k, j])
+        for g in range(dampers.count.shape[1]):
+            start = dampers.region_start[g]
+            for c in range(start, start + dampers.count[e, g]):
+                lack = damper_lack(e, c, dampers, twist_out)
+                if lack > ZERO:
+                    row = vec16()
+                    for i in range(n):
+                        row[i] = damper_entry(
+                            tree, dampers.screw[e, i], dampers.moment[e, c], dampers.force[e, c], dampers.side[e, c], i
+                        )
+                    for i in range(n):
+                        a = slack_weight * row[i]
+                        if a != ZERO:
+                            gradient[i] -= lack * a
+                            for j in range(i, n):
+                                matrix[i, j] += a * row[j]
         step = vec16()
         largest = ZERO
         for i in range(n):
@@ -175,24 +253,29 @@ def solve_qp(
             step = cholesky_solve(matrix, step, n)
             length = ONE
             accepted = int(0)
-            for _attempt in range(6):
-                if accepted == 0:
-                    trial = vec16()
-                    slope = ZERO
-                    for i in range(n):
-                        trial[i] = wp.clamp(x[i] + length * step[i], low[e, i], high[e, i])
-                        slope += gradient[i] * (trial[i] - x[i])
-                    trial_smooth = gradient_of(hessian, linear, trial, n)
-                    trial_cost = HALF * (wp.dot(trial, trial_smooth) - wp.dot(trial, linear))
-                    trial_cost += HALF * slack_weight * damper_cost(e, n, rows, row, bound, trial)
-                    if trial_cost <= cost + DESCENT * slope:
-                        accepted = 1
-                        cost = trial_cost
-                        x = trial
-                        smooth = trial_smooth
-                    length *= HALF
+            attempt = int(0)
+            while accepted == 0 and attempt < HALVINGS:
+                trial = vec16()
+                slope = ZERO
+                for i in range(n):
+                    trial[i] = wp.clamp(x[i] + length * step[i], low[e, i], high[e, i])
+                    slope += gradient[i] * (trial[i] - x[i])
+                trial_smooth = gradient_of(hessian, linear, trial, n)
+                trial_cost = HALF * (wp.dot(trial, trial_smooth) - wp.dot(trial, linear))
+                trial_cost += HALF * slack_weight * damper_cost(e, tree, dampers, trial, twist_out)
+                if trial_cost <= cost + DESCENT * slope:
+                    accepted = 1
+                    cost = trial_cost
+                    x = trial
+                    smooth = trial_smooth
+                length *= HALF
+                attempt += 1
             if accepted == 0:
                 done = 1
+    closest = nearest[e, 0]
+    for g in range(1, nearest.shape[1]):
+        closest = wp.min(closest, nearest[e, g])
+    min_distance_out[e] = closest
     for i in range(n):
         x_out[e, i] = x[i]
     iterations_out[e] = used
