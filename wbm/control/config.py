@@ -101,7 +101,7 @@ class WbcConfig:
     reach: float = 0.25
     reach_self: float = 0.12
     slack_weight: float = 1.0e5
-    iterations: int = 12
+    iterations: int = 40
     distance_floor: float = 0.01
     weights: WbcWeights = field(default_factory=WbcWeights)
     gains: WbcGains = field(default_factory=WbcGains)
