@@ -111,7 +111,9 @@ def _goals(rng, n, num_goals, centre, half, height, pos):
         shelf = pos[:, 5] + rng.uniform([-0.4, -0.25, 0.05], [0.4, 0.0, 0.3], (n, 3))
         clutter = pos[np.arange(n), rng.integers(8, 16, n)]
         far = rng.uniform([-2.0, -2.0, 0.1], [2.5, 2.0, 1.6], (n, 3))
-        goal[:, k] = np.select([c[:, None] for c in (choice < 0.5, choice < 0.75, choice < 0.9)], [spot, shelf, clutter], far)
+        goal[:, k] = np.select(
+            [c[:, None] for c in (choice < 0.5, choice < 0.75, choice < 0.9)], [spot, shelf, clutter], far
+        )
         yaw = rng.uniform(-np.pi, np.pi, n)
         down = np.c_[np.zeros(n), np.cos(yaw / 2), np.sin(yaw / 2), np.zeros(n)]
         level = np.c_[np.cos(yaw / 2), np.zeros(n), np.zeros(n), np.sin(yaw / 2)] @ _TO_SIDE.T
@@ -195,7 +197,9 @@ class Tally:
         self.iterations += int(controller.iterations.numpy().sum())
 
 
-def run_course(controller: WholeBodyController, seed: int, episodes: int, steps: int, tally: Tally | None = None) -> Tally:
+def run_course(
+    controller: WholeBodyController, seed: int, episodes: int, steps: int, tally: Tally | None = None
+) -> Tally:
     """Run episodes of a new course each, all environments at once.
 
     Args:

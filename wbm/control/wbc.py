@@ -232,7 +232,8 @@ class WholeBodyController:
         self._diag, self._rhs = a((n, joints), wp.float32), a((n, joints), wp.float32)
         self._q_from, self._qd_from = a((n, joints), wp.float32), a((n, joints), wp.float32)
         self._low, self._high, self._x = (a((n, joints), wp.float64) for _ in range(3))
-        self._twist_x, self._twist_d = (a((n, groups), wp.spatial_vectord) for _ in range(2))
+        self._twist = a((n, groups), wp.spatial_vectord)
+        self._lack, self._rate = a((n, c), wp.float64), a((n, c), wp.float64)
         dampers = wbc_qp.Dampers()
         dampers.region_start, dampers.count, dampers.screw = self._region_start, self._count, self._screw
         dampers.force, dampers.moment, dampers.bound, dampers.side = self._force, self._moment, self._bound, self._side
@@ -322,7 +323,7 @@ class WholeBodyController:
             wbc_qp.solve_qp,
             self.num_envs,
             [self._tree, *problem, self.cfg.slack_weight, self.cfg.iterations, self._qd_from],
-            [self._twist_x, self._twist_d, self._x, self.iterations, self.min_distance],
+            [self._twist, self._lack, self._rate, self._x, self.iterations, self.min_distance],
         )
 
     def _launch_paper(self, pose: list[wp.array], tasks: list[wp.array]) -> None:

@@ -16,7 +16,7 @@ import warp as wp
 from wbm.kernels import wbc_objectives as obj
 from wbm.kernels.kinematics import Tree, finite_or
 from wbm.kernels.wbc_assemble import Frames, Limits, Targets, moved, se3_axis
-from wbm.kernels.wbc_qp import cholesky_solve, task_hessian, vec16
+from wbm.kernels.wbc_qp import cholesky_solve, damper_entry, task_hessian, task_linear
 
 wp.set_module_options({"enable_backward": False})
 

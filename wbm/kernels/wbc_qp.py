@@ -22,6 +22,7 @@ vec16 = wp.types.vector(length=SIZE, dtype=wp.float64)
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
 HALF = wp.constant(wp.float64(0.5))
+LEAST_DAMPING = wp.constant(wp.float64(1.0e-6))
 PIVOT = wp.constant(wp.float64(1.0e-9))
 DESCENT = wp.constant(wp.float64(1.0e-4))
 PROJECTED = wp.constant(3)
@@ -32,6 +33,15 @@ TOLERANCE = wp.constant(wp.float64(1.0e-7))
 
 
 @wp.func
+def task_row(e: int, r: int, n: int, jac: wp.array3d(dtype=wp.float32)) -> vec16:
+    """Row r of an environment's Jacobian."""
+    row = vec16()
+    for i in range(n):
+        row[i] = wp.float64(jac[e, r, i])
+    return row
+
+
+@wp.func
 def task_hessian(
     e: int,
     n: int,
@@ -39,18 +49,18 @@ def task_hessian(
     weight: wp.array2d(dtype=wp.float32),
     diag: wp.array2d(dtype=wp.float32),
 ) -> mat16:
-    """Upper triangle of `sum_r w_r J_r^T J_r + diag(h)`."""
+    """`sum_r w_r J_r^T J_r + diag(h)`, built and kept row by row, which fills vector registers."""
     hessian = mat16()
     for r in range(jac.shape[1]):
         w = wp.float64(weight[e, r])
         if w > ZERO:
+            row = task_row(e, r, n, jac)
             for i in range(n):
-                s = w * wp.float64(jac[e, r, i])
+                s = w * row[i]
                 if s != ZERO:
-                    for j in range(i, n):
-                        hessian[i, j] += s * wp.float64(jac[e, r, j])
+                    hessian[i] = hessian[i] + s * row
     for i in range(n):
-        hessian[i, i] += wp.max(wp.float64(diag[e, i]), wp.float64(1.0e-6))
+        hessian[i, i] += wp.max(wp.float64(diag[e, i]), LEAST_DAMPING)
     return hessian
 
 
@@ -70,38 +80,33 @@ def task_linear(
     for r in range(jac.shape[1]):
         s = wp.float64(weight[e, r]) * wp.float64(vel[e, r])
         if s != ZERO:
-            for i in range(n):
-                linear[i] += s * wp.float64(jac[e, r, i])
+            linear += s * task_row(e, r, n, jac)
     return linear
 
 
 @wp.func
-def gradient_of(hessian: mat16, linear: vec16, x: vec16, n: int) -> vec16:
-    """`H x - g` from the upper triangle of H."""
-    out = -linear
+def times(matrix: mat16, x: vec16, n: int) -> vec16:
+    """`M x` of a symmetric matrix."""
+    out = vec16()
     for i in range(n):
-        out[i] += hessian[i, i] * x[i]
-        for j in range(i + 1, n):
-            out[i] += hessian[i, j] * x[j]
-            out[j] += hessian[i, j] * x[i]
+        out += x[i] * matrix[i]
     return out
 
 
 @wp.func
 def cholesky_solve(matrix: mat16, rhs: vec16, n: int) -> vec16:
-    """Solution of a symmetric positive definite system given by its upper triangle, `M = U^T D U`."""
+    """Solution of a symmetric positive definite system by `M = U^T D U`."""
     m = matrix
     y = rhs
     for k in range(n):
-        pivot = wp.max(m[k, k], PIVOT)
-        inverse = ONE / pivot
+        inverse = ONE / wp.max(m[k, k], PIVOT)
+        pivot_row = m[k]
         y_k = y[k]
         for i in range(k + 1, n):
-            factor = m[k, i] * inverse
+            factor = pivot_row[i] * inverse
             if factor != ZERO:
                 y[i] -= factor * y_k
-                for j in range(i, n):
-                    m[i, j] -= factor * m[k, j]
+                m[i] = m[i] - factor * pivot_row
         y[k] = y_k * inverse
         m[k, k] = inverse
     for back in range(n):
@@ -127,20 +132,28 @@ class Dampers:
 
 
 @wp.func
-def damper_entry(tree: Tree, screw: wp.spatial_vector, moment: wp.vec3, force: wp.vec3, side: wp.vec2i, j: int) -> wp.float64:
+def damper_entry(
+    tree: Tree, screw: wp.spatial_vector, moment: wp.vec3, force: wp.vec3, side: wp.vec2i, j: int
+) -> wp.float64:
     """`dd/dq_j`: the speed of a pair's distance for unit velocity of joint j."""
     sign = (tree.group_mask[side[0]] >> j) & 1
     if side[1] >= 0:
         sign -= (tree.group_mask[side[1]] >> j) & 1
     entry = ZERO
     if sign != 0:
-        entry = wp.float64(float(sign) * (wp.dot(wp.spatial_top(screw), moment) + wp.dot(wp.spatial_bottom(screw), force)))
+        entry = wp.float64(
+            float(sign) * (wp.dot(wp.spatial_top(screw), moment) + wp.dot(wp.spatial_bottom(screw), force))
+        )
     return entry
 
 
 @wp.func
 def group_twists(
-    e: int, tree: Tree, screw: wp.array2d(dtype=wp.spatial_vector), x: vec16, twist_out: wp.array2d(dtype=wp.spatial_vectord)
+    e: int,
+    tree: Tree,
+    screw: wp.array2d(dtype=wp.spatial_vector),
+    x: vec16,
+    twist_out: wp.array2d(dtype=wp.spatial_vectord),
 ):
     """Twist of every group of spheres at the joint velocities x, along the tree."""
     for g in range(tree.group_parent.shape[0]):
@@ -167,55 +180,58 @@ def damper_speed(e: int, i: int, dampers: Dampers, twist: wp.array2d(dtype=wp.sp
 
 
 @wp.func
-def slope_along(
+def all_speeds(
     e: int,
+    tree: Tree,
     dampers: Dampers,
-    twist_x: wp.array2d(dtype=wp.spatial_vectord),
-    twist_d: wp.array2d(dtype=wp.spatial_vectord),
-    length: wp.float64,
+    x: vec16,
+    twist_out: wp.array2d(dtype=wp.spatial_vectord),
+    speed_out: wp.array2d(dtype=wp.float64),
 ):
-    """First and second derivative of `1/2 sum_k max(0, b_k - A_k (x + t d))^2` in t at `length`."""
-    first = ZERO
-    second = ZERO
+    """`A x` for every candidate."""
+    group_twists(e, tree, dampers.screw, x, twist_out)
     for g in range(dampers.count.shape[1]):
         start = dampers.region_start[g]
         for i in range(start, start + dampers.count[e, g]):
-            rate = damper_speed(e, i, dampers, twist_d)
-            lack = wp.float64(dampers.bound[e, i]) - damper_speed(e, i, dampers, twist_x) - length * rate
-            if lack > ZERO:
-                first -= lack * rate
-                second += rate * rate
-    return first, second
+            speed_out[e, i] = damper_speed(e, i, dampers, twist_out)
 
 
 @wp.func
 def exact_length(
     e: int,
     dampers: Dampers,
-    twist_x: wp.array2d(dtype=wp.spatial_vectord),
-    twist_d: wp.array2d(dtype=wp.spatial_vectord),
+    lack: wp.array2d(dtype=wp.float64),
+    rate: wp.array2d(dtype=wp.float64),
     slope: wp.float64,
     curvature: wp.float64,
     slack_weight: wp.float64,
 ) -> wp.float64:
     """Where in [0, 1] the function is least along a step downhill: Newton's method on its slope, bracketed.
 
-    `slope` and `curvature` are those of the smooth part. The slope is piecewise linear and rising, so a few steps do.
-    Landing on the far side of a damper's kink is what makes the damper act in the next iteration.
+    `slope` and `curvature` are those of the smooth part, `lack - t rate` is what dampers lack at t. The slope is
+    piecewise linear and rising, so a few steps do. Landing on the far side of a damper's kink is what makes the
+    damper act in the next iteration.
     """
     least = ZERO
     most = ONE
     length = ONE
     for _search in range(SEARCH):
-        first, second = slope_along(e, dampers, twist_x, twist_d, length)
-        rise = slope + length * curvature + slack_weight * first
+        rise = slope + length * curvature
+        bend = curvature
+        for g in range(dampers.count.shape[1]):
+            start = dampers.region_start[g]
+            for i in range(start, start + dampers.count[e, g]):
+                left = lack[e, i] - length * rate[e, i]
+                if left > ZERO:
+                    rise -= slack_weight * left * rate[e, i]
+                    bend += slack_weight * rate[e, i] * rate[e, i]
         if rise > ZERO:
             most = length
         else:
             least = length
             if length == ONE:
                 return length
-        guess = length - rise / wp.max(curvature + slack_weight * second, PIVOT)
+        guess = length - rise / wp.max(bend, PIVOT)
         if wp.abs(guess - length) < FINE:
             return wp.clamp(guess, least, most)
         if guess <= least or guess >= most:
@@ -275,8 +291,9 @@ def solve_qp(
     iterations: wp.int32,
     qd_start: wp.array2d(dtype=wp.float32),  # [N,J]
     # out:
-    twist_x_out: wp.array2d(dtype=wp.spatial_vectord),  # [N,G] scratch: twists at x
-    twist_d_out: wp.array2d(dtype=wp.spatial_vectord),  # [N,G] scratch: twists of the step
+    twist_out: wp.array2d(dtype=wp.spatial_vectord),  # [N,G] scratch
+    lack_out: wp.array2d(dtype=wp.float64),  # [N,C] scratch: b - A x
+    rate_out: wp.array2d(dtype=wp.float64),  # [N,C] scratch: A times the step
     x_out: wp.array2d(dtype=wp.float64),  # [N,J]
     iterations_out: wp.array(dtype=wp.int32),  # [N]
     min_distance_out: wp.array(dtype=wp.float32),  # [N]
@@ -289,9 +306,12 @@ def solve_qp(
     x = vec16()
     for i in range(n):
         x[i] = wp.clamp(wp.float64(qd_start[e, i]), low[e, i], high[e, i])
-    smooth = gradient_of(hessian, linear, x, n)
-    zero = vec16()
-    group_twists(e, tree, dampers.screw, x, twist_x_out)
+    smooth = times(hessian, x, n) - linear
+    all_speeds(e, tree, dampers, x, twist_out, lack_out)
+    for g in range(dampers.count.shape[1]):
+        start = dampers.region_start[g]
+        for c in range(start, start + dampers.count[e, g]):
+            lack_out[e, c] = wp.float64(dampers.bound[e, c]) - lack_out[e, c]
     done = int(0)
     used = int(0)
     held = int(0)  # bits of the variables that this iteration keeps on their bounds
@@ -302,7 +322,7 @@ def solve_qp(
         for g in range(dampers.count.shape[1]):
             start = dampers.region_start[g]
             for c in range(start, start + dampers.count[e, g]):
-                lack = wp.float64(dampers.bound[e, c]) - damper_speed(e, c, dampers, twist_x_out)
+                lack = lack_out[e, c]
                 if lack > ZERO:
                     row = vec16()
                     for i in range(n):
@@ -312,9 +332,8 @@ def solve_qp(
                     for i in range(n):
                         a = slack_weight * row[i]
                         if a != ZERO:
-                            gradient[i] -= lack * a
-                            for j in range(i, n):
-                                matrix[i, j] += a * row[j]
+                            matrix[i] = matrix[i] + a * row
+                    gradient -= (slack_weight * lack) * row
         # A variable on its bound is well placed if the gradient presses it there; one that is not may move.
         placed = int(0)
         wrong = int(-1)
@@ -344,10 +363,9 @@ def solve_qp(
                 step[i] = -gradient[i]
                 if (held >> i) & 1 == 1:
                     step[i] = ZERO
-                    for j in range(i):
+                    matrix[i] = vec16()
+                    for j in range(n):
                         matrix[j, i] = ZERO
-                    for j in range(i + 1, n):
-                        matrix[i, j] = ZERO
                     matrix[i, i] = ONE
             step = cholesky_solve(matrix, step, n)
             slope = ZERO
@@ -359,17 +377,20 @@ def solve_qp(
                 newton_slope += gradient[i] * step[i]
             if used > PROJECTED or slope > DESCENT * newton_slope:
                 move = straight_move(e, n, x, step, low, high)
-            group_twists(e, tree, dampers.screw, move, twist_d_out)
-            turned = gradient_of(hessian, zero, move, n)
+            all_speeds(e, tree, dampers, move, twist_out, rate_out)
+            turned = times(hessian, move, n)
             length = exact_length(
-                e, dampers, twist_x_out, twist_d_out, wp.dot(smooth, move), wp.dot(turned, move), slack_weight
+                e, dampers, lack_out, rate_out, wp.dot(smooth, move), wp.dot(turned, move), slack_weight
             )
+            smooth += length * turned
             for i in range(n):
                 x[i] = snap(x[i] + length * move[i], low[e, i], high[e, i])
                 if step[i] != ZERO and (x[i] <= low[e, i] or x[i] >= high[e, i]):
                     held |= 1 << i
-            smooth = gradient_of(hessian, linear, x, n)
-            group_twists(e, tree, dampers.screw, x, twist_x_out)
+            for g in range(dampers.count.shape[1]):
+                start = dampers.region_start[g]
+                for c in range(start, start + dampers.count[e, g]):
+                    lack_out[e, c] = lack_out[e, c] - length * rate_out[e, c]
     closest = nearest[e, 0]
     for g in range(1, nearest.shape[1]):
         closest = wp.min(closest, nearest[e, g])
