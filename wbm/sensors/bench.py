@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from wbm.sensors.ray_sensor import RaySensor
 from wbm.sensors.scene import Instances, RayScene
 
 SIZES = (48, 56, 128, 256)
+TYPICAL = 56
 NUM_MESHES = 4
 SILHOUETTE = 1e-6  # rad; a float32 direction is worth about 1e-7
 TOLERANCE = 1e-4  # m
@@ -196,46 +198,68 @@ def measure_exactness(
     }
 
 
-def rate(work: Callable[[], Any], num_rays: int, repeats: int) -> float:
-    """Median million rays per second of CPU time on this process."""
-    work()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return num_rays / max(float(np.median(times)), 1e-9) / 1e6
+@dataclass
+class Workload:
+    """Something to time: `run` casts `rays` rays; `best` is the least CPU time seen, s."""
+
+    run: Callable[[], Any]
+    rays: int
+    best: float = np.inf
+
+    @property
+    def mrays_s(self) -> float:
+        return self.rays / max(self.best, 1e-9) / 1e6
 
 
-def measure_speed(num_instances: int, num_envs: int, repeats: int, peers: bool, seed: int = 1) -> dict[str, Any]:
-    """Rates of both sensors, of `mj_multiRay` and of the peers over the same scenes and rays (64 x 48 and 2,048)."""
+def speed_workloads(num_instances: int, num_envs: int, peers: bool, seed: int = 1) -> dict[str, Workload]:
+    """Both sensors (64 x 48 and 2,048 rays), `mj_multiRay` and the peers over the same scenes and rays."""
     depth, lidar = DepthConfig(width=64, height=48), LidarConfig(num_rays=2048)
     setup = make_setup(seed, num_envs, num_instances, depth, lidar, 4, random_robot=False)
-    out: dict[str, Any] = {"instances": num_instances}
     oracles = [setup.oracle(env) for env in range(min(num_envs, 8))]
+    out = {}
     for name, sensor in (("depth", setup.camera), ("lidar", setup.lidar)):
-        every = sensor.env_index(None)
-        total = num_envs * sensor.num_rays
-        out[f"{name}_mrays_s"] = rate(sensor.render, total, repeats)
-        out[f"{name}_range_only_mrays_s"] = rate(lambda s=sensor, e=every: s.trace(e), total, repeats)
+        sensor.render()
+        few = len(oracles) * sensor.num_rays
+        out[f"{name}_mrays_s"] = Workload(sensor.render, num_envs * sensor.num_rays)
+        out[f"{name}_range_only_mrays_s"] = Workload(
+            partial(sensor.trace, sensor.env_index(None)), num_envs * sensor.num_rays
+        )
         rays, origins = bench_peers.world_rays(sensor, len(oracles))
-
-        def cast(sensor: RaySensor = sensor, rays: np.ndarray = rays, origins: np.ndarray = origins) -> None:
-            for oracle, ray, origin in zip(oracles, rays, origins, strict=True):
-                oracle.cast(origin, ray, sensor.exclude_body)
-
-        out[f"mj_multiray_{name}"] = rate(cast, len(oracles) * sensor.num_rays, max(repeats // 2, 1))
-        out[f"{name}_speedup"] = out[f"{name}_mrays_s"] / out[f"mj_multiray_{name}"]
+        out[f"mj_multiray_{name}"] = Workload(
+            partial(bench_peers.cast_all, oracles, rays, origins, sensor.exclude_body), few
+        )
         if peers:
             for peer, work in bench_peers.workloads(oracles, sensor, setup.meshes).items():
-                out[f"{peer}_{name}"] = rate(work, len(oracles) * sensor.num_rays, max(repeats // 2, 1))
+                out[f"{peer}_{name}"] = Workload(work, few)
+    return out
+
+
+def measure_speed(sizes: tuple[int, ...], num_envs: int, rounds: int, peers: bool) -> list[dict[str, Any]]:
+    """Million rays per second of CPU time on one thread for every number of instances; peers at `TYPICAL`.
+
+    Rounds go over all workloads and the fastest time of each counts: other load on the machine only ever adds time, and
+    all workloads meet the same load.
+    """
+    work = {size: speed_workloads(size, num_envs, peers and size == TYPICAL) for size in sizes}
+    for turn in range(rounds + 1):
+        for job in (job for jobs in work.values() for job in jobs.values()):
+            start = time.process_time()
+            job.run()
+            # The first turn warms up.
+            job.best = min(job.best, time.process_time() - start) if turn else np.inf
+    out = []
+    for size, jobs in work.items():
+        row = {"instances": size} | {name: job.mrays_s for name, job in jobs.items()}
+        for name in ("depth", "lidar"):
+            row[f"{name}_speedup"] = row[f"{name}_mrays_s"] / row[f"mj_multiray_{name}"]
+        out.append(row)
     return out
 
 
 def bench_sensors(
     num_scenes: int = 200,
     num_rays: int = 1_000_000,
-    repeats: int = 9,
+    rounds: int = 15,
     peers: bool = True,
     assets: tuple[ObjectSet, SceneBank] | None = None,
 ) -> dict[str, Any]:
@@ -243,14 +267,11 @@ def bench_sensors(
 
     Args:
         num_scenes, num_rays: size of the comparison with `mj_multiRay`.
-        repeats: timings of which the median counts.
+        rounds: timings of which the fastest counts.
         peers: also time mujoco-lidar and embreex when they are installed.
         assets: objects and scene bank of an assets artifact for the comparison; None uses generated table tops.
     """
     wp.config.quiet = True
-    scaling = [measure_speed(size, 32, repeats, peers and size == 56) for size in SIZES]
-    typical = next(row for row in scaling if row["instances"] == 56)
-    keys = ("depth_mrays_s", "lidar_mrays_s", "mj_multiray_depth", "mj_multiray_lidar")
-    out = {key: typical[key] for key in keys}
-    out |= {key: value for key, value in typical.items() if key not in out and key != "instances"}
-    return out | measure_exactness(num_scenes, num_rays, assets) | {"instances_scaling": scaling}
+    scaling = measure_speed(SIZES, 32, rounds, peers)
+    typical = {k: v for k, v in next(row for row in scaling if row["instances"] == TYPICAL).items() if k != "instances"}
+    return typical | measure_exactness(num_scenes, num_rays, assets) | {"instances_scaling": scaling}
