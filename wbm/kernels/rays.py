@@ -392,6 +392,9 @@ def trace_rays(
     near: wp.array2d[float],
     cand_count: wp.array2d[int],  # [N,G]
     cand: wp.array3d[wp.int16],  # [N,G,I]
+    # scratch:
+    best_scratch: wp.array2d[float],  # [N,R] bundle order
+    inst_scratch: wp.array2d[int],  # [N,R]
     # out:
     range_out: wp.array2d[float],  # [N,R] -1 where nothing is hit
     instance_out: wp.array2d[int],  # [N,R] -1 where nothing is hit
@@ -404,9 +407,8 @@ def trace_rays(
     end = wp.min(first + chunk, direction.shape[1])
     g = first // bundle
     for k in range(first, end):
-        out = order[row, k]
-        range_out[env, out] = max_range
-        instance_out[env, out] = -1
+        best_scratch[env, k] = max_range
+        inst_scratch[env, k] = -1
     # An instance's data is loaded once for all rays of the thread; it may stop when all hits lie before the next one.
     farthest = float(max_range)
     for j in range(cand_count[env, g]):
@@ -424,8 +426,7 @@ def trace_rays(
         mesh_id = mesh[env, s]
         farthest = float(0.0)
         for k in range(first, end):
-            out = order[row, k]
-            best = range_out[env, out]
+            best = best_scratch[env, k]
             if start <= best:
                 d = direction[row, k]
                 along = wp.dot(centre, d)
@@ -433,10 +434,14 @@ def trace_rays(
                     t = ray_instance(shape, o, R_IS * d, extent, mesh_id, best)
                     if t < best:
                         best = t
-                        range_out[env, out] = t
-                        instance_out[env, out] = inst
+                        best_scratch[env, k] = t
+                        inst_scratch[env, k] = inst
             farthest = wp.max(farthest, best)
     for k in range(first, end):
         out = order[row, k]
-        if instance_out[env, out] < 0:
+        inst = inst_scratch[env, k]
+        instance_out[env, out] = inst
+        if inst >= 0:
+            range_out[env, out] = best_scratch[env, k]
+        else:
             range_out[env, out] = -1.0

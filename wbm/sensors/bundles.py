@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-BUNDLE = 64
+BUNDLE = 32
 GROUP = 8  # bundles that are culled together first
 
 

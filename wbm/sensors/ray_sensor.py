@@ -108,6 +108,7 @@ class RaySensor:
         self._sphere, self._slot_cone, self._near = new(slots, wp.vec4), new(slots, wp.vec4), new(slots, wp.float32)
         self._cand_count, self._cand = new(bundles, wp.int32), new((*bundles, slots[1]), wp.int16)
         self._group = new((n, self._group_cone.shape[1], slots[1]), wp.int16)
+        self._best, self._best_inst = new(hits, wp.float32), new(hits, wp.int32)
         self.true_range, self.true_instance = new(hits, wp.float32), new(hits, wp.int32)
         self.range, self.depth = new(hits, wp.float32), new(hits, wp.float32)
         self.instance, self.id = new(hits, wp.int32), new(hits, wp.int32)
@@ -184,7 +185,7 @@ class RaySensor:
             inputs=[
                 ids, self.pattern, self._sorted, self._order, self.bundle, self._chunk, self.reach, self._inst,
                 self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count,
-                self._cand,
+                self._cand, self._best, self._best_inst,
             ],
             outputs=[self.true_range, self.true_instance],
             device=device,
