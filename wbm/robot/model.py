@@ -37,7 +37,7 @@ Q_HOME = np.concatenate(
         [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785],
         [0.3, 0.0, 0.4, 0.3] * 3,
         [0.9, 0.9, 0.2, 0.2],
-        [0.0, 1.30, -1.20, 0.0, 0.45, 0.0],
+        [0.26, 2.10, -2.24, -0.74, 0.97, 0.83],  # looks at (0.8, 0, 0.62), 5 cm clear of the arm
     ]
 )
 
@@ -51,7 +51,7 @@ class Frame:
     quat: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # identity hash: what derives from a model is cached by it
 class RobotModel:
     """Kinematic tree of L links over 32 joints; see `docs/architecture.md` for the meaning of each field.
 
@@ -161,7 +161,13 @@ def load_robot() -> RobotModel:
     def hand_dof(joint: dict) -> _Dof:
         act = leap[joint["name"]]
         return _Dof(
-            tuple(joint["range"]), float(act["kp"]), float(act["kv"]), HAND_EFFORT, 0.0, joint["damping"], joint["frictionloss"]
+            tuple(joint["range"]),
+            float(act["kp"]),
+            float(act["kv"]),
+            HAND_EFFORT,
+            0.0,
+            joint["damping"],
+            joint["frictionloss"],
         )
 
     tree.add_part("hand", part_links("leap_right"), "arm_attachment", HAND_MOUNT_POS, HAND_MOUNT_QUAT, hand_dof)
@@ -169,7 +175,15 @@ def load_robot() -> RobotModel:
     loss = facts["piper"]["joint_armature_damping_frictionloss_published"]
 
     def neck_dof(joint: dict) -> _Dof:
-        return _Dof(tuple(joint["range"]), NECK_KP, NECK_KV, NECK_EFFORT, loss["armature"], loss["damping"], loss["frictionloss"])
+        return _Dof(
+            tuple(joint["range"]),
+            NECK_KP,
+            NECK_KV,
+            NECK_EFFORT,
+            loss["armature"],
+            loss["damping"],
+            loss["frictionloss"],
+        )
 
     neck = tuple(_with_camera(link) for link in part_links("piper"))
     tree.add_part("neck", neck, "base", NECK_MOUNT, identity, neck_dof)

@@ -1,1 +1,1 @@
-
+"""Batched physics behind one interface: MuJoCo C on CPUs, MuJoCo Warp on GPUs."""

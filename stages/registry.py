@@ -1,0 +1,89 @@
+"""Which stages there are, in order, and what a stage module must define.
+
+A stage module is light to import (torch, warp and mujoco are imported inside `run`) and defines
+
+    KIND: str                    kind of the artifact it publishes
+    SECTIONS: tuple[str, ...]    sections of the configuration it reads; reading another one fails
+    INPUTS: tuple[str, ...]      input slots: "assets", "teacher/*" (the whole suite), "policy:student" (slot:kind)
+    def name(cfg) -> str         name of the artifact under this configuration
+    def run(cfg, inputs, draft, progress) -> None
+    EACH: tuple[str, str]        optional: ("teacher", "teachers") makes `wbm run` run the stage once for each ENTRY of
+                                 `teachers`, with the override `teacher=ENTRY`
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+MODULES: dict[str, str] = {
+    "prepare-assets": "stages.prepare_assets",
+    "train-teacher": "stages.train_teacher",
+    "generate-rollouts": "stages.generate_rollouts",
+    "distill": "stages.distill",
+    "evaluate": "stages.evaluate",
+    "deploy-export": "stages.deploy_export",
+}
+
+
+@dataclass(frozen=True)
+class Slot:
+    """An input: its name for the stage, the kind of artifact, and whether it takes the whole suite."""
+
+    name: str
+    kind: str
+    every: bool
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage as the pipeline sees it."""
+
+    name: str
+    module: str
+    kind: str
+    sections: tuple[str, ...]
+    slots: tuple[Slot, ...]
+    artifact_name: Callable[[Any], str]
+    run: Callable[..., None]
+    each: tuple[str, str] | None
+
+
+def slot(text: str) -> Slot:
+    """Parse `kind`, `kind/*` or `slot:kind`."""
+    every = text.endswith("/*")
+    name, _, kind = text.removesuffix("/*").partition(":")
+    return Slot(name, kind or name, every)
+
+
+def load(name: str) -> Stage:
+    """Import a stage module.
+
+    Raises:
+        KeyError: no such stage.
+        AttributeError: the module does not define what a stage must.
+    """
+    module = importlib.import_module(MODULES[name])
+    return Stage(
+        name=name,
+        module=MODULES[name],
+        kind=module.KIND,
+        sections=tuple(module.SECTIONS),
+        slots=tuple(slot(text) for text in module.INPUTS),
+        artifact_name=module.name,
+        run=module.run,
+        each=getattr(module, "EACH", None),
+    )
+
+
+def load_all() -> list[Stage]:
+    """All stages in pipeline order."""
+    return [load(name) for name in MODULES]
+
+
+def load_until(name: str) -> list[Stage]:
+    """The stages up to and including `name`."""
+    names = list(MODULES)
+    return [load(other) for other in names[: names.index(name) + 1]]

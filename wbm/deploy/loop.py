@@ -1,0 +1,132 @@
+"""The closed loop around a driver, and its timing."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wbm.deploy.driver import Driver, check_driver
+from wbm.deploy.faults import Refused
+from wbm.deploy.log import RunLog
+from wbm.deploy.runtime import PolicyRuntime
+
+
+@dataclass
+class LoopReport:
+    """What happened in a run.
+
+    Attributes:
+        steps: commands sent.
+        refusals: number of refusals by name.
+        missed: steps whose computation took longer than one policy period.
+        compute_s: computing time of each step, s.
+        start_s: when each step started, s (monotonic clock).
+        stopped_by: name of the refusal that ended the run, or an empty string.
+    """
+
+    steps: int = 0
+    refusals: Counter[str] = field(default_factory=Counter)
+    missed: int = 0
+    compute_s: list[float] = field(default_factory=list)
+    start_s: list[float] = field(default_factory=list)
+    stopped_by: str = ""
+
+    def timing(self) -> dict[str, float]:
+        """Percentiles of computing time and the jitter of the step's start (standard deviation of the period), s."""
+        return timing_summary(np.array(self.compute_s), np.array(self.start_s))
+
+
+def timing_summary(compute_s: np.ndarray, start_s: np.ndarray) -> dict[str, float]:
+    """`p50_s`, `p99_s`, `max_s` of computing times and `jitter_s`, `jitter_max_s` of the period."""
+    if not len(compute_s):
+        return {"p50_s": 0.0, "p99_s": 0.0, "max_s": 0.0, "jitter_s": 0.0, "jitter_max_s": 0.0}
+    period = np.diff(start_s)
+    spread = np.abs(period - np.median(period)) if len(period) else np.zeros(1)
+    return {
+        "p50_s": float(np.percentile(compute_s, 50)),
+        "p99_s": float(np.percentile(compute_s, 99)),
+        "max_s": float(compute_s.max()),
+        "jitter_s": float(period.std()) if len(period) else 0.0,
+        "jitter_max_s": float(spread.max()),
+    }
+
+
+def run_loop(
+    driver: Driver, runtime: PolicyRuntime, steps: int, log: RunLog | None = None, max_refusals: int = 25
+) -> LoopReport:
+    """Run the policy in closed loop.
+
+    A refusal never reaches the driver as a command: the driver is told to hold, and the loop goes on with the next reading.
+
+    Args:
+        driver: robot or simulator.
+        runtime: the policy; it is reset first.
+        steps: number of periods.
+        log: where to log, if at all.
+        max_refusals: this many refusals in a row end the run.
+
+    Raises:
+        Refused: `DRIVER_MISMATCH` before anything moves.
+    """
+    check_driver(driver.info, runtime.contract)
+    runtime.reset()
+    report, in_a_row = LoopReport(), 0
+    for _ in range(steps):
+        try:
+            reading = driver.read()
+            begin = time.monotonic()
+            command = runtime.step(reading, driver.now())
+            spent = time.monotonic() - begin
+            driver.command(command)
+        except Refused as refused:
+            driver.hold(refused.fault.value)
+            runtime.recover()
+            report.refusals[refused.fault.value] += 1
+            in_a_row += 1
+            if log is not None:
+                log.refusal(driver.now(), refused)
+            if in_a_row >= max_refusals:
+                report.stopped_by = refused.fault.value
+                break
+            continue
+        in_a_row = 0
+        report.steps += 1
+        report.compute_s.append(spent)
+        report.start_s.append(begin)
+        report.missed += spent > runtime.contract.dt
+        if log is not None:
+            log.reading(reading)
+            log.command(command, runtime.observation)
+    driver.hold("end of run")
+    return report
+
+
+def measure_latency(runtime: PolicyRuntime, driver: Driver, steps: int = 1000, warmup: int = 50) -> dict[str, float]:
+    """Process time and wall time of `PolicyRuntime.step` on readings of a driver, without waiting between them.
+
+    Wall time is what the robot sees; process time is what the computation costs on a machine that is busy with other work.
+
+    Returns:
+        `cpu_p50_s`, `cpu_p99_s`, `wall_p50_s`, `wall_p99_s`, `jitter_s` (standard deviation of the wall time) and `steps`.
+    """
+    runtime.reset()
+    cpu, wall = np.zeros(steps), np.zeros(steps)
+    for i in range(warmup + steps):
+        reading = driver.read()
+        now = driver.now()
+        c0, w0 = time.process_time(), time.perf_counter()
+        command = runtime.step(reading, now)
+        if i >= warmup:
+            cpu[i - warmup], wall[i - warmup] = time.process_time() - c0, time.perf_counter() - w0
+        driver.command(command)
+    return {
+        "steps": steps,
+        "cpu_p50_s": float(np.percentile(cpu, 50)),
+        "cpu_p99_s": float(np.percentile(cpu, 99)),
+        "wall_p50_s": float(np.percentile(wall, 50)),
+        "wall_p99_s": float(np.percentile(wall, 99)),
+        "jitter_s": float(wall.std()),
+    }

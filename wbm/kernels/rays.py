@@ -1,0 +1,427 @@
+"""Ray casting over per-environment instances: placement, bundle culling and exact intersection.
+
+All rays of a sensor start at one point, so everything that depends on the origin alone is computed once an instance
+(`place_instances`). Rays come in bundles of neighbours; an instance enters a bundle's list only if its bounding sphere
+touches the bundle's cone (`cull_bundles`), nearest first, so that a ray stops at the first sphere that starts behind
+its hit (`trace_rays`). Geometry types and sizes use MuJoCo's numbers. Distances are along unit rays, in metres.
+"""
+
+# ruff: noqa: RUF046, SIM109, UP018 (int(0) declares a dynamic variable in a Warp kernel; `in` is not compiled)
+import warp as wp
+
+from wbm.kernels.se3 import quat_wxyz_normalize, quat_wxyz_to_mat
+
+PLANE = wp.constant(0)
+SPHERE = wp.constant(2)
+CAPSULE = wp.constant(3)
+CYLINDER = wp.constant(5)
+BOX = wp.constant(6)
+MESH = wp.constant(7)
+
+MISS = wp.constant(1.0e30)
+UNBOUNDED = wp.constant(1.0e12)
+
+
+@wp.func
+def ray_plane(o: wp.vec3, d: wp.vec3, size: wp.vec3) -> float:
+    """Front side of z = 0, bounded to `|x| <= size.x`, `|y| <= size.y` where those are positive."""
+    if d[2] > -1.0e-9 or o[2] < 0.0:
+        return MISS
+    t = -o[2] / d[2]
+    if size[0] > 0.0 and wp.abs(o[0] + t * d[0]) > size[0]:
+        return MISS
+    if size[1] > 0.0 and wp.abs(o[1] + t * d[1]) > size[1]:
+        return MISS
+    return t
+
+
+@wp.func
+def ray_sphere(o: wp.vec3, d: wp.vec3, radius: float) -> float:
+    """Sphere about the origin; the discriminant is taken at the closest approach, where float32 loses nothing."""
+    t_mid = -wp.dot(o, d)
+    q = o + t_mid * d
+    h = radius * radius - wp.dot(q, q)
+    if h < 0.0:
+        return MISS
+    h = wp.sqrt(h)
+    t = t_mid - h
+    if t < 0.0:
+        t = t_mid + h
+    if t < 0.0:
+        return MISS
+    return t
+
+
+@wp.func
+def ray_capsule(o: wp.vec3, d: wp.vec3, radius: float, half: float) -> float:
+    """Capsule along z: the first point outward of its cylinder wall and its two caps."""
+    a = d[0] * d[0] + d[1] * d[1]
+    t_side = MISS
+    if a > 1.0e-12:
+        t_mid = -(o[0] * d[0] + o[1] * d[1]) / a
+        x = o[0] + t_mid * d[0]
+        y = o[1] + t_mid * d[1]
+        h = radius * radius - x * x - y * y
+        if h < 0.0:
+            return MISS
+        h = wp.sqrt(h / a)
+        t = t_mid - h
+        if t >= 0.0 and wp.abs(o[2] + t * d[2]) <= half:
+            return t
+        t = t_mid + h
+        if t >= 0.0 and wp.abs(o[2] + t * d[2]) <= half:
+            t_side = t
+    # A cap counts only outside the wall's span, where it is the surface.
+    t_cap = MISS
+    for side in range(2):
+        z = half * (2.0 * float(side) - 1.0)
+        s = z / wp.max(half, 1.0e-9)
+        oc = wp.vec3(o[0], o[1], o[2] - z)
+        t_mid = -wp.dot(oc, d)
+        q = oc + t_mid * d
+        h = radius * radius - wp.dot(q, q)
+        if h >= 0.0:
+            h = wp.sqrt(h)
+            t = t_mid - h
+            if t >= 0.0 and s * (oc[2] + t * d[2]) >= 0.0:
+                t_cap = wp.min(t_cap, t)
+            t = t_mid + h
+            if t >= 0.0 and s * (oc[2] + t * d[2]) >= 0.0:
+                t_cap = wp.min(t_cap, t)
+    return wp.min(t_side, t_cap)
+
+
+@wp.func
+def ray_cylinder(o: wp.vec3, d: wp.vec3, radius: float, half: float) -> float:
+    """Cylinder along z: the interval inside the wall cut with the interval between the ends."""
+    t0 = -MISS
+    t1 = MISS
+    a = d[0] * d[0] + d[1] * d[1]
+    if a > 1.0e-12:
+        t_mid = -(o[0] * d[0] + o[1] * d[1]) / a
+        x = o[0] + t_mid * d[0]
+        y = o[1] + t_mid * d[1]
+        h = radius * radius - x * x - y * y
+        if h < 0.0:
+            return MISS
+        h = wp.sqrt(h / a)
+        t0 = t_mid - h
+        t1 = t_mid + h
+    elif o[0] * o[0] + o[1] * o[1] > radius * radius:
+        return MISS
+    if wp.abs(d[2]) > 1.0e-12:
+        mid = -o[2] / d[2]
+        ext = wp.abs(half / d[2])
+        t0 = wp.max(t0, mid - ext)
+        t1 = wp.min(t1, mid + ext)
+    elif wp.abs(o[2]) > half:
+        return MISS
+    if t0 > t1 or t1 < 0.0:
+        return MISS
+    if t0 < 0.0:
+        return t1
+    return t0
+
+
+@wp.func
+def ray_box(o: wp.vec3, d: wp.vec3, size: wp.vec3) -> float:
+    """Box by slabs; a direction component of zero gives infinite slab ends of the right sign."""
+    t0 = -MISS
+    t1 = MISS
+    for i in range(3):
+        if wp.abs(d[i]) > 1.0e-12:
+            inv = 1.0 / d[i]
+            mid = -o[i] * inv
+            ext = wp.abs(size[i] * inv)
+            t0 = wp.max(t0, mid - ext)
+            t1 = wp.min(t1, mid + ext)
+        elif wp.abs(o[i]) > size[i]:
+            t1 = -MISS
+    if t0 > t1 or t1 < 0.0:
+        return MISS
+    if t0 < 0.0:
+        return t1
+    return t0
+
+
+@wp.func
+def ray_instance(kind: int, o: wp.vec3, d: wp.vec3, size: wp.vec3, mesh: wp.uint64, limit: float) -> float:
+    """Range to one instance in its own frame, `MISS` if there is none; meshes are searched up to `limit`."""
+    if kind == BOX:
+        return ray_box(o, d, size)
+    if kind == CAPSULE:
+        return ray_capsule(o, d, size[0], size[1])
+    if kind == PLANE:
+        return ray_plane(o, d, size)
+    if kind == CYLINDER:
+        return ray_cylinder(o, d, size[0], size[1])
+    if kind == SPHERE:
+        return ray_sphere(o, d, size[0])
+    query = wp.mesh_query_ray(mesh, o, d, limit)
+    if query.result:
+        return query.t
+    return MISS
+
+
+@wp.func
+def bounding_radius(kind: int, size: wp.vec3) -> float:
+    """Radius about the geometry's own origin that encloses a primitive."""
+    if kind == SPHERE:
+        return size[0]
+    if kind == CAPSULE:
+        return size[0] + size[1]
+    if kind == CYLINDER:
+        return wp.sqrt(size[0] * size[0] + size[1] * size[1])
+    if kind == BOX:
+        return wp.length(size)
+    return UNBOUNDED
+
+
+@wp.func
+def is_inside(kind: int, o: wp.vec3, size: wp.vec3, mesh: wp.uint64, mesh_radius: float) -> bool:
+    """Whether a point in the instance's frame lies strictly inside it (below it, for a plane)."""
+    if kind == PLANE:
+        return o[2] < 0.0
+    if kind == SPHERE:
+        return wp.length(o) < size[0]
+    if kind == CAPSULE:
+        return wp.length(wp.vec3(o[0], o[1], o[2] - wp.clamp(o[2], -size[1], size[1]))) < size[0]
+    if kind == CYLINDER:
+        return o[0] * o[0] + o[1] * o[1] < size[0] * size[0] and wp.abs(o[2]) < size[1]
+    if kind == BOX:
+        return wp.abs(o[0]) < size[0] and wp.abs(o[1]) < size[1] and wp.abs(o[2]) < size[2]
+    query = wp.mesh_query_point_sign_winding_number(mesh, o, 2.0 * mesh_radius)
+    return query.result and query.sign < 0.0
+
+
+@wp.kernel(enable_backward=False)
+def place_instances(
+    # in:
+    env_ids: wp.array[int],  # [n]
+    sensor_pos: wp.array[wp.vec3],  # [N]
+    sensor_quat: wp.array[wp.vec4],  # [N] w x y z
+    exclude_body: int,
+    view_axis: wp.vec3,  # sensor frame
+    view_cos: float,
+    view_sin: float,
+    max_range: float,
+    body_pos: wp.array2d[wp.vec3],  # [N,B]
+    body_quat: wp.array2d[wp.vec4],  # [N,B] w x y z
+    inst_type: wp.array2d[int],  # [N,I]
+    inst_size: wp.array2d[wp.vec3],
+    inst_mesh: wp.array2d[int],
+    inst_body: wp.array2d[int],
+    inst_pos: wp.array2d[wp.vec3],
+    inst_quat: wp.array2d[wp.vec4],
+    mesh_ids: wp.array[wp.uint64],  # [K]
+    mesh_sphere: wp.array[wp.vec4],  # [K] centre, radius
+    # out:
+    ok_out: wp.array[int],  # [N]
+    count_out: wp.array[int],  # [N]
+    inst_out: wp.array2d[int],  # [N,I] slot -> instance
+    kind_out: wp.array2d[int],
+    size_out: wp.array2d[wp.vec3],
+    mesh_out: wp.array2d[wp.uint64],
+    rot_out: wp.array2d[wp.mat33],  # sensor frame -> instance frame
+    origin_out: wp.array2d[wp.vec3],  # sensor origin in the instance frame
+    sphere_out: wp.array2d[wp.vec4],  # centre c of the bounding sphere in the sensor frame, |c|^2 - r^2
+    cone_out: wp.array2d[wp.vec4],  # direction of its centre, cosine of its angular radius
+    near_out: wp.array2d[float],  # its nearest range, 0 if it holds the sensor
+):
+    """List the instances that the sensor may see, in its own frame; `ok` is 0 where no ray can be trusted."""
+    env = env_ids[wp.tid()]
+    pos = sensor_pos[env]
+    quat = sensor_quat[env]
+    ok = wp.isfinite(pos) and wp.isfinite(quat) and wp.length_sq(quat) > 1.0e-12
+    R_WS = quat_wxyz_to_mat(quat_wxyz_normalize(quat))
+    count = int(0)
+    for i in range(inst_type.shape[1]):
+        kind = inst_type[env, i]
+        body = inst_body[env, i]
+        if ok and kind >= 0 and (body != exclude_body or body < 0):
+            finite = wp.isfinite(inst_quat[env, i])
+            R_WI = quat_wxyz_to_mat(quat_wxyz_normalize(inst_quat[env, i]))
+            p_WI = inst_pos[env, i]
+            if body >= 0:
+                R_WB = quat_wxyz_to_mat(quat_wxyz_normalize(body_quat[env, body]))
+                p_WI = body_pos[env, body] + R_WB * p_WI
+                R_WI = R_WB * R_WI
+                finite = finite and wp.isfinite(body_quat[env, body])
+            offset = p_WI - pos
+            size = inst_size[env, i]
+            mesh = wp.uint64(0)
+            centre = wp.vec3(0.0, 0.0, 0.0)
+            radius = bounding_radius(kind, size)
+            if kind == MESH:
+                index = inst_mesh[env, i]
+                mesh = mesh_ids[index]
+                centre = wp.vec3(mesh_sphere[index][0], mesh_sphere[index][1], mesh_sphere[index][2])
+                radius = mesh_sphere[index][3]
+            origin = -wp.transpose(R_WI) * offset
+            if not (finite and wp.isfinite(origin)):
+                ok = False
+            else:
+                c = wp.transpose(R_WS) * (offset + R_WI * centre)
+                distance = wp.length(c)
+                if distance < radius and is_inside(kind, origin, size, mesh, radius):
+                    ok = False
+                along = wp.dot(c, view_axis)
+                aside = wp.sqrt(wp.max(distance * distance - along * along, 0.0))
+                if distance - radius < max_range and aside * view_cos - along * view_sin <= radius * 1.001:
+                    inst_out[env, count] = i
+                    kind_out[env, count] = kind
+                    size_out[env, count] = size
+                    mesh_out[env, count] = mesh
+                    rot_out[env, count] = wp.transpose(R_WI) * R_WS
+                    origin_out[env, count] = origin
+                    # Widened, so that rounding never loses a hit.
+                    bound = wp.min(radius * 1.0001 + 1.0e-6 * distance, UNBOUNDED)
+                    sphere_out[env, count] = wp.vec4(c[0], c[1], c[2], distance * distance * 0.999999 - bound * bound)
+                    near_out[env, count] = wp.max(distance - bound, 0.0)
+                    u = c / wp.max(distance, 1.0e-9)
+                    sine = wp.min(bound / wp.max(distance, 1.0e-9), 1.0)
+                    cone_out[env, count] = wp.vec4(u[0], u[1], u[2], wp.sqrt(1.0 - sine * sine))
+                    count += 1
+    if ok:
+        ok_out[env] = 1
+        count_out[env] = count
+    else:
+        ok_out[env] = 0
+        count_out[env] = 0
+
+
+@wp.func
+def is_leaving(kind: int, o: wp.vec3, size: wp.vec3, axis: wp.vec3, cos_half: float, sin_half: float) -> bool:
+    """Whether a face's outer half space holds the origin and every ray of a cone leads further out; instance frame.
+
+    The least component of a cone's directions along a face normal n is `cos(angle(axis, n) + half)`.
+    """
+    if kind == CAPSULE or kind == SPHERE or kind == MESH:
+        return False
+    for i in range(3):
+        extent = size[i]
+        if kind == PLANE:
+            extent = 0.0
+        if kind == CYLINDER:
+            extent = size[1]
+        side = wp.sign(o[i])
+        if (kind == BOX or i == 2) and wp.abs(o[i]) > extent:
+            a = side * axis[i]
+            if a * cos_half - wp.sqrt(wp.max(1.0 - a * a, 0.0)) * sin_half > 1.0e-4:
+                return True
+    return False
+
+
+@wp.kernel(enable_backward=False)
+def cull_bundles(
+    # in:
+    env_ids: wp.array[int],  # [n]
+    pattern: wp.array[int],  # [N] row of the ray table
+    cone: wp.array2d[wp.vec4],  # [Q,G] axis, cosine of the half angle
+    count: wp.array[int],  # [N]
+    slot_cone: wp.array2d[wp.vec4],  # [N,I]
+    near: wp.array2d[float],  # [N,I]
+    kind: wp.array2d[int],
+    size: wp.array2d[wp.vec3],
+    rot: wp.array2d[wp.mat33],
+    origin: wp.array2d[wp.vec3],
+    # out:
+    cand_count_out: wp.array2d[int],  # [N,G]
+    cand_out: wp.array3d[wp.int16],  # [N,G,I] slots, nearest first
+):
+    """Slots whose bounding sphere touches each bundle's cone and that lie ahead, sorted by their nearest range."""
+    i, g = wp.tid()
+    env = env_ids[i]
+    c4 = cone[pattern[env], g]
+    axis = wp.vec3(c4[0], c4[1], c4[2])
+    cos_half = c4[3]
+    sin_half = wp.sqrt(wp.max(1.0 - cos_half * cos_half, 0.0))
+    num = int(0)
+    for s in range(count[env]):
+        s4 = slot_cone[env, s]
+        # Two cones with one apex meet where the angle between their axes is at most the sum of their half angles.
+        together = cos_half * s4[3] - sin_half * wp.sqrt(wp.max(1.0 - s4[3] * s4[3], 0.0))
+        key = near[env, s]
+        if key <= 0.0 or c4[0] * s4[0] + c4[1] * s4[1] + c4[2] * s4[2] >= together - 1.0e-5 or cos_half < 0.0:
+            local = rot[env, s] * axis
+            leaving = cos_half > 0.0 and is_leaving(
+                kind[env, s], origin[env, s], size[env, s], local, cos_half, sin_half
+            )
+            if not leaving:
+                j = int(num)
+                while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
+                    cand_out[env, g, j] = cand_out[env, g, j - 1]
+                    j -= 1
+                cand_out[env, g, j] = wp.int16(s)
+                num += 1
+    cand_count_out[env, g] = num
+
+
+@wp.kernel(enable_backward=False)
+def trace_rays(
+    # in:
+    env_ids: wp.array[int],  # [n]
+    pattern: wp.array[int],  # [N]
+    direction: wp.array2d[wp.vec3],  # [Q,R] unit, bundle order, sensor frame
+    order: wp.array2d[int],  # [Q,R] bundle order -> ray
+    bundle: int,
+    chunk: int,  # rays of a thread
+    max_range: float,
+    slot_inst: wp.array2d[int],  # [N,I]
+    kind: wp.array2d[int],
+    size: wp.array2d[wp.vec3],
+    mesh: wp.array2d[wp.uint64],
+    rot: wp.array2d[wp.mat33],
+    origin: wp.array2d[wp.vec3],
+    sphere: wp.array2d[wp.vec4],
+    near: wp.array2d[float],
+    cand_count: wp.array2d[int],  # [N,G]
+    cand: wp.array3d[wp.int16],  # [N,G,I]
+    # out:
+    range_out: wp.array2d[float],  # [N,R] -1 where nothing is hit
+    instance_out: wp.array2d[int],  # [N,R] -1 where nothing is hit
+):
+    """Nearest hit of every ray along its bundle's list."""
+    i, c = wp.tid()
+    env = env_ids[i]
+    row = pattern[env]
+    first = c * chunk
+    end = wp.min(first + chunk, direction.shape[1])
+    g = first // bundle
+    for k in range(first, end):
+        out = order[row, k]
+        range_out[env, out] = max_range
+        instance_out[env, out] = -1
+    # An instance's data is loaded once for all rays of the thread; it may stop when all hits lie before the next one.
+    farthest = float(max_range)
+    for j in range(cand_count[env, g]):
+        s = int(cand[env, g, j])
+        start = near[env, s]
+        if start > farthest:
+            break
+        s4 = sphere[env, s]
+        centre = wp.vec3(s4[0], s4[1], s4[2])
+        inst = slot_inst[env, s]
+        shape = kind[env, s]
+        R_IS = rot[env, s]
+        o = origin[env, s]
+        extent = size[env, s]
+        mesh_id = mesh[env, s]
+        farthest = float(0.0)
+        for k in range(first, end):
+            out = order[row, k]
+            best = range_out[env, out]
+            if start <= best:
+                d = direction[row, k]
+                along = wp.dot(centre, d)
+                if s4[3] <= 0.0 or (along > 0.0 and along * along >= s4[3]):
+                    t = ray_instance(shape, o, R_IS * d, extent, mesh_id, best)
+                    if t < best:
+                        best = t
+                        range_out[env, out] = t
+                        instance_out[env, out] = inst
+            farthest = wp.max(farthest, best)
+    for k in range(first, end):
+        out = order[row, k]
+        if instance_out[env, out] < 0:
+            range_out[env, out] = -1.0

@@ -1,0 +1,65 @@
+"""Sorting of a sensor's rays into bundles of neighbours with bounding cones (done once, on the host)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+BUNDLE = 64
+
+
+@dataclass(frozen=True)
+class RayTable:
+    """Q interchangeable patterns of R unit rays in G bundles, sensor frame.
+
+    Attributes:
+        rays: unit directions [Q,R,3] in the order of the outputs.
+        order: [Q,R] index of the output ray at each place of the bundle order.
+        cone: [Q,G,4] axis and cosine of the half angle of each bundle.
+        view: axis [3] and half angle (rad) of a cone that holds all rays of all patterns.
+    """
+
+    rays: np.ndarray
+    order: np.ndarray
+    cone: np.ndarray
+    view: tuple[np.ndarray, float]
+
+
+def build_table(rays: np.ndarray, bundle: int = BUNDLE) -> RayTable:
+    """Bundle every pattern of `rays` [Q,R,3] (unit)."""
+    rays = np.asarray(rays, np.float64)
+    order = np.stack([_split(r, bundle) for r in rays]).astype(np.int32)
+    groups = -(-rays.shape[1] // bundle)
+    cone = np.empty((len(rays), groups, 4))
+    for p, pattern in enumerate(rays):
+        for g in range(groups):
+            axis, half = _cone(pattern[order[p, g * bundle : (g + 1) * bundle]])
+            cone[p, g] = [*axis, np.cos(half)]
+    return RayTable(rays, order, cone, _cone(rays.reshape(-1, 3)))
+
+
+def _cone(rays: np.ndarray) -> tuple[np.ndarray, float]:
+    """Axis and half angle of a cone around unit rays, widened by a float32 margin; pi when there is no narrow one."""
+    axis = (rays.min(0) + rays.max(0)) / 2
+    norm = np.linalg.norm(axis)
+    if norm < 1e-6:
+        return np.array([0.0, 0.0, 1.0]), np.pi
+    axis = axis / norm
+    half = float(np.arccos(np.clip((rays @ axis).min(), -1.0, 1.0))) + 1e-3
+    return (axis, half) if half < np.pi / 2 else (axis, np.pi)
+
+
+def _split(rays: np.ndarray, bundle: int) -> np.ndarray:
+    """Order that halves the rays along their widest axis until a bundle is left; all bundles but the last are full."""
+    stack, out = [np.arange(len(rays))], []
+    while stack:
+        part = stack.pop()
+        if len(part) <= bundle:
+            out.append(part)
+            continue
+        spread = np.ptp(rays[part], axis=0)
+        part = part[np.argsort(rays[part, int(np.argmax(spread))], kind="stable")]
+        cut = max(len(part) // bundle // 2, 1) * bundle
+        stack += [part[cut:], part[:cut]]
+    return np.concatenate(out)

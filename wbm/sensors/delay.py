@@ -1,0 +1,85 @@
+"""Latency: frames reach the policy late, and some never do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import warp as wp
+
+from wbm.kernels.noise_delay import pass_frame, plan_delivery, restart_delivery
+from wbm.sensors.config import DelayConfig
+
+
+class FrameDelay:
+    """A ring buffer of frames an environment; a frame is a set of arrays with a row an environment.
+
+    Attributes:
+        out: the delivered arrays, same names, shapes and types.
+        age: [N] int32, steps since the delivered frame was measured.
+    """
+
+    def __init__(self, config: DelayConfig, frame: Mapping[str, wp.array], key: wp.array, seed: int = 0) -> None:
+        """Allocate the ring.
+
+        Args:
+            config: when frames are delivered.
+            frame: live arrays [N,...] that hold the newest frame, all contiguous.
+            key: [N] int32 live episode key, as the sensors use it.
+            seed: of the draws.
+        """
+        self.config, self.key, self.seed, self._frame = config, key, int(seed), dict(frame)
+        device, n = key.device, key.shape[0]
+        self._ring_size = config.delay_max + (config.hold_max if config.lost > 0 else 0) + 1
+        self._count, self._last = (wp.zeros(n, dtype=wp.int32, device=device) for _ in range(2))
+        self._write, self._read = (wp.zeros(n, dtype=wp.int32, device=device) for _ in range(2))
+        self.age = wp.zeros(n, dtype=wp.int32, device=device)
+        self.out = {name: wp.zeros_like(array) for name, array in self._frame.items()}
+        self._views = []
+        for name, array in self._frame.items():
+            width = array.strides[0] if n else 0
+            ring = wp.zeros((n, self._ring_size, width), dtype=wp.uint8, device=device)
+            self._views.append((_bytes(array, n, width), ring, _bytes(self.out[name], n, width)))
+
+    def reset(self, env_ids: wp.array) -> None:
+        """Start an episode in the given environments (device index array): frames from before it are forgotten."""
+        if env_ids.shape[0] > 0:
+            wp.launch(
+                restart_delivery,
+                dim=env_ids.shape[0],
+                inputs=[env_ids],
+                outputs=[self._count, self._last],
+                device=self.key.device,
+            )
+
+    def push(self, env_ids: wp.array) -> None:
+        """Take the newest frame of the given environments and update `out` and `age`."""
+        if env_ids.shape[0] == 0:
+            return
+        c, device = self.config, self.key.device
+        wp.launch(
+            plan_delivery,
+            dim=env_ids.shape[0],
+            inputs=[
+                env_ids, self.key, self.seed, c.delay_min, c.delay_max, c.lost, self._ring_size, self._count,
+                self._last,
+            ],
+            outputs=[self._write, self._read, self.age],
+            device=device,
+        )  # fmt: skip
+        for source, ring, out in self._views:
+            wp.launch(
+                pass_frame,
+                dim=(env_ids.shape[0], source.shape[1]),
+                inputs=[env_ids, self._write, self._read, source, ring],
+                outputs=[out],
+                device=device,
+            )
+
+
+def _bytes(array: wp.array, rows: int, width: int) -> wp.array:
+    """The array's memory as [rows,width] bytes; the caller keeps the array alive."""
+    if rows == 0 or width == 0:
+        return wp.zeros((rows, width), dtype=wp.uint8, device=array.device)
+    if not array.is_contiguous:
+        raise ValueError("FrameDelay: frame arrays must be contiguous")
+    return wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(rows, width), device=array.device)

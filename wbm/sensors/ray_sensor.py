@@ -1,0 +1,211 @@
+"""One ray routine for every sensor: aim, place, cull, trace, fill."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from wbm.kernels.noise import RayNoise, aim_sensors
+from wbm.kernels.points import fill_hits
+from wbm.kernels.rays import cull_bundles, place_instances, trace_rays
+from wbm.sensors.bundles import BUNDLE, RayTable, build_table
+from wbm.sensors.config import ExtrinsicNoise
+from wbm.sensors.scene import RayScene
+
+EnvIds = Sequence[int] | np.ndarray | wp.array | None
+
+
+class RaySensor:
+    """Casts a table of R rays from one origin an environment, Q interchangeable patterns.
+
+    Live inputs, `wp.array`s over the N environments:
+        pos [vec3], quat [vec4, w x y z]: believed pose of the sensor frame in the world.
+        step [int32]: policy step of the episode. key [int32]: a number that no two episodes share (default: the
+        environment's index). Noise depends on (seed, key, step) alone.
+        level [float32]: factor on every deviation and chance of the noise models (default 1).
+
+    Outputs, `wp.array`s [N,R]; `valid` False comes with -1 in numbers and zeros in vectors:
+        range: distance along the ray, m. depth: coordinate along sensor z, m.
+        instance: index of the instance in the scene. id: its semantic id. color [vec3]: RGB in 0..1. valid [bool].
+        point_s, point_w [vec3]: in the sensor frame and in the world (through the believed pose), m.
+        true_range, true_instance: what the ray meets within reach, before limits and noise, -1 for none.
+        ok [N]: 0 where nothing can be trusted (a pose that is not finite, a sensor inside an object): all is invalid.
+    """
+
+    def __init__(
+        self,
+        scene: RayScene,
+        rays: np.ndarray,
+        min_range: float,
+        max_range: float,
+        *,
+        planar: bool = False,
+        turn: float = 0.0,
+        exclude_body: int = -1,
+        bundle: int = BUNDLE,
+        noise: RayNoise | None = None,
+        extrinsic: ExtrinsicNoise | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Sort the rays and allocate outputs for every environment.
+
+        Args:
+            scene: what is seen.
+            rays: unit directions [Q,R,3] in the head's frame; an environment uses pattern `step % Q`.
+            min_range, max_range: limits on the range, or on the depth if `planar`, m.
+            planar: whether the limits are on depth.
+            turn: revolutions of the head about sensor z in a step.
+            exclude_body: body whose instances are not seen: the sensor's own (-1: none).
+            bundle: rays in a culling bundle.
+            noise: error model of each return; None is exact.
+            extrinsic: mounting error; None is exact.
+            seed: of all noise.
+        """
+        self.scene, self.min_range, self.max_range, self.planar = scene, float(min_range), float(max_range), planar
+        self.exclude_body, self.bundle, self.seed, self._turn = int(exclude_body), bundle, int(seed), float(turn)
+        self.noise, self.extrinsic = noise or RayNoise(), extrinsic or ExtrinsicNoise()
+        self.noise.seed = self.seed
+        # A corner ray is longer than its planar depth.
+        self.reach = self.max_range / float(rays[..., 2].min()) if planar else self.max_range
+        self.table: RayTable = build_table(rays, bundle)
+        self.num_envs, self.num_rays = scene.num_envs, rays.shape[1]
+        # A CPU thread takes a whole bundle, which spares the cost of starting a thread a ray.
+        self._chunk = bundle if scene.device.is_cpu else 1
+        self._upload_table()
+        self._allocate()
+
+    def _upload_table(self) -> None:
+        table, device = self.table, self.scene.device
+        in_order = np.take_along_axis(table.rays, table.order[:, :, None].astype(np.int64), axis=1)
+        self.rays = wp.array(table.rays.astype(np.float32), dtype=wp.vec3, device=device)
+        self._sorted = wp.array(in_order.astype(np.float32), dtype=wp.vec3, device=device)
+        self._order = wp.array(table.order, dtype=wp.int32, device=device)
+        self._cone = wp.array(table.cone.astype(np.float32), dtype=wp.vec4, device=device)
+
+    def _allocate(self) -> None:
+        n, device = self.num_envs, self.scene.device
+        envs, hits, slots = (n,), (n, self.num_rays), (n, self.scene.num_instances)
+        bundles = (n, self.table.cone.shape[1])
+
+        def new(shape: tuple[int, ...], dtype: type) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self._all = wp.array(np.arange(n), dtype=wp.int32, device=device)
+        self.pos, self.quat = new(envs, wp.vec3), new(envs, wp.vec4)
+        self.quat.fill_(wp.vec4(1.0, 0.0, 0.0, 0.0))
+        self.step, self.key = new(envs, wp.int32), wp.clone(self._all)
+        self.level = wp.ones(envs, dtype=wp.float32, device=device)
+        self.pattern, self.ok = new(envs, wp.int32), new(envs, wp.int32)
+        self.true_pos, self.true_quat = new(envs, wp.vec3), new(envs, wp.vec4)
+        self._head, self._rotation = new(envs, wp.mat33), new(envs, wp.mat33)
+        self._count = new(envs, wp.int32)
+        self._inst, self._kind = new(slots, wp.int32), new(slots, wp.int32)
+        self._size, self._mesh = new(slots, wp.vec3), new(slots, wp.uint64)
+        self._rot, self._origin = new(slots, wp.mat33), new(slots, wp.vec3)
+        self._sphere, self._slot_cone, self._near = new(slots, wp.vec4), new(slots, wp.vec4), new(slots, wp.float32)
+        self._cand_count, self._cand = new(bundles, wp.int32), new((*bundles, slots[1]), wp.int16)
+        self.true_range, self.true_instance = new(hits, wp.float32), new(hits, wp.int32)
+        self.range, self.depth = new(hits, wp.float32), new(hits, wp.float32)
+        self.instance, self.id = new(hits, wp.int32), new(hits, wp.int32)
+        self.color, self.valid = new(hits, wp.vec3), new(hits, wp.bool)
+        self.point_s, self.point_w = new(hits, wp.vec3), new(hits, wp.vec3)
+
+    def env_index(self, env_ids: EnvIds) -> wp.array:
+        """Device array of environment indices; all of them for None.
+
+        Raises:
+            ValueError: an index out of range.
+        """
+        if env_ids is None:
+            return self._all
+        if isinstance(env_ids, wp.array):
+            return env_ids
+        ids = np.asarray(env_ids, np.int32).reshape(-1)
+        if len(ids) and (ids.min() < 0 or ids.max() >= self.num_envs):
+            raise ValueError(f"render: environment index outside 0..{self.num_envs - 1}")
+        return wp.array(ids, dtype=wp.int32, device=self.scene.device)
+
+    def render(self, env_ids: EnvIds = None) -> None:
+        """Measure in the given environments (all for None) at their live poses and steps; other outputs stay.
+
+        Raises:
+            ValueError: an index out of range.
+        """
+        ids = self.env_index(env_ids)
+        if ids.shape[0] > 0:
+            self.trace(ids)
+            self.fill(ids)
+
+    def trace(self, ids: wp.array) -> None:
+        """Fill `true_range` and `ok` of the given environments."""
+        s, device, num = self.scene, self.scene.device, ids.shape[0]
+        axis, half = self.table.view
+        wp.launch(
+            aim_sensors,
+            dim=num,
+            inputs=[
+                ids, self.step, self.key, self.level, self.seed, self.extrinsic.sigma_pos, self.extrinsic.sigma_rot,
+                self._turn, self.table.rays.shape[0], self.pos, self.quat,
+            ],
+            outputs=[self.pattern, self.true_pos, self.true_quat, self._head, self._rotation],
+            device=device,
+        )  # fmt: skip
+        wp.launch(
+            place_instances,
+            dim=num,
+            inputs=[
+                ids, self.true_pos, self.true_quat, self.exclude_body, wp.vec3(*axis), float(np.cos(half)),
+                max(float(np.sin(half)), 0.0), self.reach, s.body_pos, s.body_quat, s.type, s.size, s.mesh, s.body,
+                s.pos, s.quat, s.mesh_ids, s.mesh_sphere,
+            ],
+            outputs=[
+                self.ok, self._count, self._inst, self._kind, self._size, self._mesh, self._rot, self._origin,
+                self._sphere, self._slot_cone, self._near,
+            ],
+            device=device,
+        )  # fmt: skip
+        wp.launch(
+            cull_bundles,
+            dim=(num, self._cand_count.shape[1]),
+            inputs=[
+                ids, self.pattern, self._cone, self._count, self._slot_cone, self._near, self._kind, self._size,
+                self._rot, self._origin,
+            ],
+            outputs=[self._cand_count, self._cand],
+            device=device,
+        )  # fmt: skip
+        wp.launch(
+            trace_rays,
+            dim=(num, -(-self.num_rays // self._chunk)),
+            inputs=[
+                ids, self.pattern, self._sorted, self._order, self.bundle, self._chunk, self.reach, self._inst,
+                self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count,
+                self._cand,
+            ],
+            outputs=[self.true_range, self.true_instance],
+            device=device,
+        )  # fmt: skip
+
+    @property
+    def placed(self) -> tuple[wp.array, ...]:
+        """Instances as the last `trace` listed them: count [N]; kind, size, mesh, rotation and origin in the instance's
+        frame, bounding sphere in the sensor's and its nearest range [N,I]."""
+        return self._count, self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near
+
+    def fill(self, ids: wp.array) -> None:
+        """Apply the noise and derive depth, ids, colour, flags and points of the given environments."""
+        wp.launch(
+            fill_hits,
+            dim=(ids.shape[0], -(-self.num_rays // self._chunk)),
+            inputs=[
+                ids, self.pattern, self.step, self.key, self.level, self.noise, self._chunk, self.rays, self.pos,
+                self._head, self._rotation, self.planar, self.min_range, self.max_range, self.true_range,
+                self.true_instance, self.scene.id, self.scene.color,
+            ],
+            outputs=[
+                self.range, self.depth, self.instance, self.id, self.color, self.valid, self.point_s, self.point_w,
+            ],
+            device=self.scene.device,
+        )  # fmt: skip
