@@ -40,6 +40,8 @@ class PolicyRuntime:
         self.observation: dict[str, np.ndarray] = {}
         self.set_instruction(instruction)
         self.reset()
+        # The first run of a network plans its memory: do it here, not in the first step.
+        self._policy({f.name: np.zeros((1, *f.shape), f.dtype) for f in self.contract.schema.observation})
 
     def reset(self) -> None:
         """Start a new episode."""
