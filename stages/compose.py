@@ -105,7 +105,7 @@ def _compose_raw(overrides: Sequence[str]) -> DictConfig:
         _check_override(item, loader)
     try:
         return hydra_compose(CONFIG_NAME, overrides=list(overrides), return_hydra_config=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except Exception as error:  # Hydra raises whatever its parts raise, AssertionError and TypeError among them
         raise ConfigError(_one_line(error)) from error
 
 
@@ -118,7 +118,7 @@ def build(cfg: DictConfig) -> Config:
     try:
         own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
         values = cast("dict[str, Any]", OmegaConf.to_container(own, resolve=True, throw_on_missing=True))
-    except OmegaConfBaseException as error:
+    except (OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_one_line(error)) from error
     return convert(Config, values)
 
@@ -129,11 +129,13 @@ def _check_override(item: Override, loader: Any) -> None:
         raise ConfigError(f"{item.input_line}: several values; add -m to run them all")
     if key.startswith("hydra.") or key.startswith("hydra/"):
         raise ConfigError(f"{key}: Hydra's own settings have no effect here; set artifacts.root=DIR for the output")
+    if not key:
+        raise ConfigError(f"{item.input_line}: names no key; write key=value")
     if loader.list_groups(parent_name=key) or loader.get_group_options(key):
         options = loader.get_group_options(key)
         value = item.value()
-        if isinstance(value, str) and value not in options and not item.is_delete():
-            raise ConfigError(f"{key}={value}: no such preset{nearest(value, options)}")
+        if not isinstance(value, dict) and value not in options and not item.is_delete():
+            raise ConfigError(f"{key}={value}: no such preset{nearest(str(value), options)}")
         return
     hint: Any = Config
     walked: list[str] = []

@@ -17,6 +17,7 @@ class ActionConfig:
         ee_turn: the same for rotation, rad a step.
         ee_leash: the target stays within this distance of the hand, m.
         ee_turn_leash: the same for rotation, rad.
+        feed_forward: share of the target's own velocity that the controller is told.
         hand_step: hand joint motion at an action of 1, rad a step, for each joint's own value.
         closure_step: the same for the common closure.
         finger_step: the same for a finger's closure.
@@ -33,6 +34,7 @@ class ActionConfig:
     ee_turn: float = 0.06
     ee_leash: float = 0.06
     ee_turn_leash: float = 0.35
+    feed_forward: float = 0.8
     hand_step: float = 0.06
     closure_step: float = 0.10
     finger_step: float = 0.08
@@ -154,6 +156,10 @@ class EnvConfig:
         pregrasp_share: share of whole-body episodes that start at the pre-grasp all the same.
         episode_s: length of the contact-rich phase, s.
         approach_s: time allowed for the approach in whole-body episodes, s.
+        approach_speed: speed of the end-effector target on its way to the pre-grasp, m/s.
+        approach_turn: the same for rotation, rad/s.
+        approach_leash: how far the target may run ahead of the hand, m.
+        approach_back: the way leads over a point this far behind the pre-grasp against the approach direction, m.
         success_height: lift above the settled height that counts, m.
         success_hold_s: how long it must be held, s.
         standoff: distance from the object's surface to the grasp frame at the pre-grasp, m.
@@ -171,6 +177,10 @@ class EnvConfig:
     pregrasp_share: float = 0.0
     episode_s: float = 3.6
     approach_s: float = 6.0
+    approach_speed: float = 0.5
+    approach_turn: float = 1.5
+    approach_leash: float = 0.15
+    approach_back: float = 0.12
     success_height: float = 0.10
     success_hold_s: float = 1.0
     standoff: float = 0.06

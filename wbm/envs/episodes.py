@@ -190,7 +190,7 @@ class EpisodeRunner:
         self._tally["grasp_step"][ids] = -1.0
         self._rest_height[ids] = env.object_poses()[ids, :, 2].float()
         if self.noise:
-            rows = self.noise(env.episode[ids].cpu().numpy(), env.max_steps + 1)
+            rows = self.noise(env.episode[ids].cpu().numpy(), env.limit_steps + 1)
             if len(self._noise) == 0:
                 self._noise = torch.zeros(rows.shape[1], env.num_envs, joints.NUM_JOINTS, device=env.device)
             self._noise[:, ids] = torch.from_numpy(rows).to(self._noise).transpose(0, 1)

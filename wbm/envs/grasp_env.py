@@ -36,6 +36,7 @@ class GraspEnv:
         state: the present `GraspState`.
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
+        phase: 0 free space, 1 contact-rich [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
     """
 
@@ -63,7 +64,7 @@ class GraspEnv:
         self._pick = self.columns.add("scene")
         self._start = self.columns.add("start")
         self._hand = self.columns.add("start_hand", 16)
-        self.action = make_action(cfg.action, robot, num_envs, device)
+        self.action = make_action(cfg.action, robot, num_envs, self.period, device)
         self.observe = TeacherObservation(robot, self.action.offset_labels, self.action.labels, device)
         self.reader = StateReader(robot, self.sim, self.controller, binding, cfg, self.period)
         self.outcome = Outcome(cfg, self.period, num_envs, device)
@@ -74,6 +75,17 @@ class GraspEnv:
         self.noise: Tensor | None = None
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
         self.next_episode = 0
+        self.phase = torch.ones(num_envs, dtype=torch.uint8, device=device)
+
+    @property
+    def limit_steps(self) -> int:
+        """Policy steps after which an episode ends in any case."""
+        return self.max_steps
+
+    def object_poses(self) -> Tensor:
+        """World poses of target and distractors [N,1+D,7], position and quaternion (w x y z)."""
+        first, count = self.binding.target_qpos.start, 1 + self.binding.num_distractors
+        return self.sim.qpos[:, first : first + 7 * count].view(self.num_envs, count, 7)
 
     @property
     def num_actions(self) -> int:
@@ -113,7 +125,7 @@ class GraspEnv:
         parts = {"action": self.action, "hand": self.action.hand, "outcome": self.outcome, "reader": self.reader}
         for part, item in parts.items():
             own |= {f"{part}.{name}": value for name, value in vars(item).items() if name in item.STATE}
-        return own | {"controller.qd": self.qd_target, "controller.min_distance": self.min_distance}
+        return own | {f"controller.{name}": tensor for name, tensor in self._controller_state.items()}
 
     def _uniforms(self, episodes: np.ndarray) -> Tensor:
         return torch.from_numpy(episode_uniforms(self.seed, episodes, self.columns.count)).to(self.device)
@@ -121,9 +133,7 @@ class GraspEnv:
     def _load_physics(self, ids: Tensor, u: Tensor, scenes: Tensor) -> None:
         """Write scenes and randomised physics of environments `ids`, with fresh simulation state."""
         self.sim.reset(ids)
-        self.binding.load(self.sim, ids, scenes)
-        self.randomizer.apply(ids, u)
-        self.sim.set_const(ids)
+        self.randomizer.load(ids, scenes, u)
 
     def _begin(self, ids: Tensor) -> None:
         """Start the next episodes in environments `ids` (sorted)."""
@@ -136,7 +146,7 @@ class GraspEnv:
             scenes = (u[:, self._pick].squeeze(1) * table.count).long().clamp_(max=table.count - 1)
         else:
             scenes = torch.from_numpy(episodes % table.count).to(self.device)
-        q = self.starts.draw(scenes, u[:, self._start].squeeze(1))
+        q = self._start_joints(ids, scenes, u)
         hand = self.cfg.randomization.start_hand
         if hand.on:
             q[:, joints.HAND] += hand.low + (hand.high - hand.low) * u[:, self._hand]
@@ -160,6 +170,18 @@ class GraspEnv:
         ee = self.reader.ee
         self.action.reset(ids, q, self.frame_pos[ids, ee], self.frame_quat[ids, ee])
 
+    def _start_joints(self, ids: Tensor, scenes: Tensor, u: Tensor) -> Tensor:
+        """Joint positions [K,32] in which the episodes of environments `ids` start."""
+        return self.starts.draw(scenes, u[:, self._start].squeeze(1))
+
+    def _contact_steps(self) -> Tensor:
+        """Policy steps [N] since the contact-rich phase began."""
+        return self.elapsed
+
+    def _time_up(self) -> Tensor:
+        """Episodes [N] whose time has run out."""
+        return self.elapsed >= self.max_steps
+
     # Steps
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
@@ -168,7 +190,9 @@ class GraspEnv:
         Returns:
             The observation [N,O] (of the next episode where one ended), rewards [N], done flags [N] and a dictionary:
             `time_outs` [N] (ended by time alone), `outcome` [N] (see `outcome.REASONS`, `RUNNING` where it goes on),
-            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step belonged to.
+            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step belonged to,
+            `ctrl` [N,32] clean joint targets, and `ended`, what the step led to before any restart: `held`, `height`,
+            `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
         """
         action = action.clamp(-self.cfg.action.limit, self.cfg.action.limit)
         s = self.state
@@ -188,12 +212,12 @@ class GraspEnv:
         if self.cfg.action.term == "joint":
             self.ctrl[:, self._body] = term.target
             return
+        self.ee_velocity.copy_(term.velocity)
         self.ee_target.copy_(term.pos)
         self.ee_target_quat.copy_(term.quat)
         self.gaze.copy_(s.obj_pos_w)
         self.controller.step()
-        # The velocity gain would brake the motion that the controller asks for: lead it by kv / kp.
-        self.ctrl[:, self._body] = self.q_target + self._lead * self.qd_target
+        self.ctrl[:, self._body] = self.body_ctrl
         if self.cfg.action.neck == "fixed":
             self.ctrl[:, joints.NECK] = self.posture[:, -6:]
 
@@ -204,24 +228,32 @@ class GraspEnv:
         self._refresh()
         reward, terms = rewards.total(self.state, action, self.previous, self.cfg.reward)
         self.previous.copy_(action)
-        code = self.outcome.update(self.state, self.reader.start_pos, self.elapsed >= self.max_steps)
+        time_up = self._time_up()
+        code = self.outcome.update(self.state, self.reader.start_pos, time_up)
         done = code != RUNNING
-        timed = done & (self.elapsed >= self.max_steps)
+        timed = done & time_up
         reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed)
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
+        info |= {"ctrl": self.ctrl.clone(), "ended": self._ended()}
         ids = done.nonzero().squeeze(1)
         if len(ids):
             self._begin(ids)
             self._refresh()
         return self.obs, reward, done, info
 
+    def _ended(self) -> dict[str, Tensor]:
+        s = self.state
+        force = s.finger_force.amax(1)
+        z = self.object_poses()[:, :, 2].clone()
+        return {"held": s.held, "height": s.height, "force": force, "forbidden": s.forbidden, "object_z": z}
+
     def _refresh(self) -> None:
         """Recompute frames, state and observation from the simulation."""
         self.q_in.copy_(self.sim.qpos[:, : joints.NUM_JOINTS])
         self.controller.forward_kinematics()
         self.state = s = self.reader.read(self.frame_pos, self.frame_quat)
-        time = self.elapsed / self.max_steps
+        time = self._contact_steps() / self.max_steps
         offset = self.action.offset(s.q, s.ee_pos_w, s.ee_quat)
         self.obs = self.observe(
             s, self.ctrl[:, joints.HAND], self.reader.support, self.min_distance, time, offset, self.previous
@@ -231,7 +263,8 @@ class GraspEnv:
 
     def _wire_controller(self) -> None:
         c = self.controller
-        self.q_in, self.qd_target, self.q_target = wp.to_torch(c.q), wp.to_torch(c.qd), wp.to_torch(c.q_target)
+        self.q_in, self.body_ctrl = wp.to_torch(c.q), wp.to_torch(c.ctrl)
+        self.ee_velocity = wp.to_torch(c.ee_lin_vel)
         self.ee_target, self.ee_target_quat = wp.to_torch(c.ee_pos), wp.to_torch(c.ee_quat)
         self.gaze, self.posture = wp.to_torch(c.gaze_point), wp.to_torch(c.q_posture)
         self.frame_pos, self.frame_quat = wp.to_torch(c.frame_pos), wp.to_torch(c.frame_quat)
@@ -240,9 +273,10 @@ class GraspEnv:
             wp.to_torch(a) for a in (c.obstacle_type, c.obstacle_size, c.obstacle_pos, c.obstacle_quat)
         )
         wp.to_torch(c.gaze_weight).fill_(0.0 if self.cfg.action.neck == "fixed" else 1.0)
+        self._controller_state = {
+            name: wp.to_torch(getattr(c, name)) for name in ("qd", "q_target", "min_distance", "_fresh")
+        }
         self._body = torch.as_tensor(joints.WBC, device=self.device)
-        lead = self.robot.kv[joints.WBC] / self.robot.kp[joints.WBC]
-        self._lead = torch.tensor(lead, dtype=torch.float32, device=self.device)
 
     def _obstacles(self, ids: Tensor, scenes: Tensor) -> None:
         t = self.binding.table

@@ -65,6 +65,7 @@ def shade_rays(
     light_rot: wp.array2d[wp.mat33],
     light_origin: wp.array2d[wp.vec3],
     light_sphere: wp.array2d[wp.vec4],
+    light_near: wp.array2d[float],
     # out:
     rgb_out: wp.array[wp.vec3],  # [R] linear
 ):

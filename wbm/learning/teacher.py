@@ -89,7 +89,7 @@ def train_teacher(
 
         # Collect
         rewards_sum, terms, outcomes = 0.0, torch.zeros(len(rewards.TERMS)), torch.zeros(len(REASONS))
-        with torch.inference_mode():
+        with torch.no_grad():
             for _ in range(ppo.steps):
                 action = alg.act(_observation(obs))
                 obs, reward, done, info = env.step(action)

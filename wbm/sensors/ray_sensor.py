@@ -68,9 +68,11 @@ class RaySensor:
         self.noise, self.extrinsic = noise or RayNoise(), extrinsic or ExtrinsicNoise()
         self.noise.seed = self.seed
         # A corner ray is longer than its planar depth.
-        self._reach = self.max_range / float(rays[..., 2].min()) if planar else self.max_range
+        self.reach = self.max_range / float(rays[..., 2].min()) if planar else self.max_range
         self.table: RayTable = build_table(rays, bundle)
         self.num_envs, self.num_rays = scene.num_envs, rays.shape[1]
+        # A CPU thread takes a whole bundle, which spares the cost of starting a thread a ray.
+        self._chunk = bundle if scene.device.is_cpu else 1
         self._upload_table()
         self._allocate()
 
@@ -102,7 +104,7 @@ class RaySensor:
         self._inst, self._kind = new(slots, wp.int32), new(slots, wp.int32)
         self._size, self._mesh = new(slots, wp.vec3), new(slots, wp.uint64)
         self._rot, self._origin = new(slots, wp.mat33), new(slots, wp.vec3)
-        self._sphere, self._near = new(slots, wp.vec4), new(slots, wp.float32)
+        self._sphere, self._slot_cone, self._near = new(slots, wp.vec4), new(slots, wp.vec4), new(slots, wp.float32)
         self._cand_count, self._cand = new(bundles, wp.int32), new((*bundles, slots[1]), wp.int16)
         self.true_range, self.true_instance = new(hits, wp.float32), new(hits, wp.int32)
         self.range, self.depth = new(hits, wp.float32), new(hits, wp.float32)
@@ -155,28 +157,32 @@ class RaySensor:
             dim=num,
             inputs=[
                 ids, self.true_pos, self.true_quat, self.exclude_body, wp.vec3(*axis), float(np.cos(half)),
-                max(float(np.sin(half)), 0.0), self._reach, s.body_pos, s.body_quat, s.type, s.size, s.mesh, s.body,
+                max(float(np.sin(half)), 0.0), self.reach, s.body_pos, s.body_quat, s.type, s.size, s.mesh, s.body,
                 s.pos, s.quat, s.mesh_ids, s.mesh_sphere,
             ],
             outputs=[
                 self.ok, self._count, self._inst, self._kind, self._size, self._mesh, self._rot, self._origin,
-                self._sphere, self._near,
+                self._sphere, self._slot_cone, self._near,
             ],
             device=device,
         )  # fmt: skip
         wp.launch(
             cull_bundles,
             dim=(num, self._cand_count.shape[1]),
-            inputs=[ids, self.pattern, self._cone, self._count, self._sphere, self._near],
+            inputs=[
+                ids, self.pattern, self._cone, self._count, self._slot_cone, self._near, self._kind, self._size,
+                self._rot, self._origin,
+            ],
             outputs=[self._cand_count, self._cand],
             device=device,
-        )
+        )  # fmt: skip
         wp.launch(
             trace_rays,
-            dim=(num, self.num_rays),
+            dim=(num, -(-self.num_rays // self._chunk)),
             inputs=[
-                ids, self.pattern, self._sorted, self._order, self.bundle, self._reach, self._inst, self._kind,
-                self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count, self._cand,
+                ids, self.pattern, self._sorted, self._order, self.bundle, self._chunk, self.reach, self._inst,
+                self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count,
+                self._cand,
             ],
             outputs=[self.true_range, self.true_instance],
             device=device,
@@ -184,19 +190,19 @@ class RaySensor:
 
     @property
     def placed(self) -> tuple[wp.array, ...]:
-        """Instances as the last `trace` listed them for each environment: count [N], kind, size, mesh, rotation and
-        origin in the instance's frame, bounding sphere in the sensor's (all [N,I])."""
-        return self._count, self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere
+        """Instances as the last `trace` listed them: count [N]; kind, size, mesh, rotation and origin in the instance's
+        frame, bounding sphere in the sensor's and its nearest range [N,I]."""
+        return self._count, self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near
 
     def fill(self, ids: wp.array) -> None:
         """Apply the noise and derive depth, ids, colour, flags and points of the given environments."""
         wp.launch(
             fill_hits,
-            dim=(ids.shape[0], self.num_rays),
+            dim=(ids.shape[0], -(-self.num_rays // self._chunk)),
             inputs=[
-                ids, self.pattern, self.step, self.key, self.level, self.noise, self.rays, self.pos, self._head,
-                self._rotation, self.planar, self.min_range, self.max_range, self.true_range, self.true_instance,
-                self.scene.id, self.scene.color,
+                ids, self.pattern, self.step, self.key, self.level, self.noise, self._chunk, self.rays, self.pos,
+                self._head, self._rotation, self.planar, self.min_range, self.max_range, self.true_range,
+                self.true_instance, self.scene.id, self.scene.color,
             ],
             outputs=[
                 self.range, self.depth, self.instance, self.id, self.color, self.valid, self.point_s, self.point_w,
