@@ -19,7 +19,7 @@ from wbm.deploy.faults import Fault, Refused
 from wbm.robot import joints
 
 STREAM = Path(__file__).with_name("panda_stream.py")
-FCI_QDD_MAX = 4.5  # rad/s^2: the control interface refuses 10, and a lost cycle doubles what it sees
+FCI_QDD_MAX = 3.0  # rad/s^2: the control interface refuses 10 (and 5,000 rad/s^3), and a lost cycle multiplies what it sees
 _STALE_S = 0.1
 
 # Franka Control Interface, FR3: joint ranges (rad), and offset (rad/s) and deceleration (rad/s^2) of the rule that narrows the
@@ -41,11 +41,18 @@ _RANGE_MARGIN, _ENVELOPE_SHARE = 0.05, 0.6  # the rule also judges the measured 
 
 @dataclass(frozen=True)
 class ArmState:
-    """Measured arm: monotonic time (s), positions and velocities [7] (rad, rad/s)."""
+    """Measured arm.
+
+    Attributes:
+        stamp: monotonic time, s.
+        q, qd: positions and velocities [7], rad and rad/s.
+        success_rate: share of the last 100 commands that reached the arm in time.
+    """
 
     stamp: float
     q: np.ndarray
     qd: np.ndarray
+    success_rate: float = 1.0
 
 
 class PandaArm:
@@ -86,6 +93,7 @@ class PandaArm:
         self._state: ArmState | None = None
         self._error: dict[str, str] | None = None
         self._first = threading.Event()
+        self.worst_success_rate = 1.0
         self._process = subprocess.Popen(
             [str(python), str(STREAM), host, json.dumps(limits)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
@@ -152,7 +160,9 @@ class PandaArm:
                 if "error" in message:
                     self._error = message
                 else:
-                    self._state = ArmState(message["t"], np.array(message["q"]), np.array(message["qd"]))
+                    rate = float(message["rate"])
+                    self._state = ArmState(message["t"], np.array(message["q"]), np.array(message["qd"]), rate)
+                    self.worst_success_rate = min(self.worst_success_rate, rate or 1.0)  # 0 before the motion starts
                 self._lock.notify_all()
             self._first.set()
         with self._lock:

@@ -6,7 +6,7 @@ errors leave as JSON lines on standard output:
 
     in   {"q": [7]}                    target to be reached in one policy period
          {"stop": true}                come to rest and end
-    out  {"t": s, "q": [7], "qd": [7]} measured
+    out  {"t": s, "q": [7], "qd": [7], "rate": r}    measured; r is the share of the last 100 commands that came in time
          {"error": text, "kind": "reflex" | "disconnected"}
 
     python panda_stream.py HOST '{"period": 0.04, "q_min": [..], "q_max": [..], "qd_max": [..], "qdd_max": [..],
@@ -153,7 +153,8 @@ def stream(host: str, limits: dict[str, Any]) -> None:
         command.motion_finished = commands.stopped and all(joint.resting for joint in joints)
         control.writeOnce(command)
         if cycle % REPORT_EVERY == 0:
-            _say({"t": time.monotonic(), "q": list(state.q), "qd": list(state.dq)})
+            rate = state.control_command_success_rate
+            _say({"t": time.monotonic(), "q": list(state.q), "qd": list(state.dq), "rate": rate})
         if command.motion_finished:
             return
         state, elapsed = control.readOnce()
