@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,9 +21,27 @@ app = typer.Typer(
 artifacts_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Look after what the stages published.")
 app.add_typer(artifacts_app, name="artifacts")
 
+STAGES = {
+    "prepare-assets": "Stage 1: objects, convex parts, settled scenes.",
+    "train-teacher": "Stage 2: a local grasping teacher.",
+    "generate-rollouts": "Stage 3: successful whole-body trajectories.",
+    "distill": "Stage 4: one student that sees and is told.",
+    "evaluate": "Stage 5: success on held-out objects, a report.",
+    "deploy-export": "Stage 6: the bundle that runs on the robot.",
+}
+
+
 Overrides = Annotated[
     list[str] | None,
     typer.Argument(metavar="[OVERRIDE]...", help="Settings as KEY=VALUE in Hydra's grammar.", show_default=False),
+]
+Items = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[ARTIFACT]... [artifacts.root=DIR]",
+        help="kind/name[/key] or reference/name.",
+        show_default=False,
+    ),
 ]
 Cfg = Annotated[bool, typer.Option("--cfg", help="Print the resolved configuration and stop.")]
 Info = Annotated[bool, typer.Option("--info", help="Print the defaults list and stop.")]
@@ -30,8 +49,19 @@ Multi = Annotated[bool, typer.Option("-m", "--multirun", help="Sweep: a,b and ra
 Launcher = Annotated[str, typer.Option("--launcher", help="Where to run: local or slurm.")]
 Detach = Annotated[bool, typer.Option("--detach", help="Submit and return at once.")]
 Force = Annotated[bool, typer.Option("--force", help="Run even if up to date, from the beginning.")]
+Until = Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+
+
+def _call(module: str, function: str, *args: Any) -> None:
+    getattr(importlib.import_module(f"stages.{module}"), function)(*args)
+
+
+def _run(stage: str | None, overrides: list[str] | None, **options: Any) -> None:
+    from stages.commands import Options, run_command
+
+    run_command(Options(stage, tuple(overrides or ()), **options))
 
 
 @app.command()
@@ -43,16 +73,16 @@ def run(
     launcher: Launcher = "local",
     detach: Detach = False,
     force: Force = False,
+    until: Until = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
-    """Run all six stages in order; skip what is up to date, continue what was interrupted."""
-    from stages.commands import run_command
+    """Run all six stages, skipping what is up to date."""
+    _run(None, overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach, force=force,
+         until=until, as_json=as_json)  # fmt: skip
 
-    run_command(None, overrides or [], cfg, info, multirun, launcher, detach, force, as_json)
 
-
-def _stage_command(name: str, text: str) -> None:
+def _add_stage(name: str, text: str) -> None:
     def command(
         overrides: Overrides = None,
         cfg: Cfg = False,
@@ -64,105 +94,148 @@ def _stage_command(name: str, text: str) -> None:
         debug: Debug = False,
         as_json: Json = False,
     ) -> None:
-        from stages.commands import run_command
-
-        run_command(name, overrides or [], cfg, info, multirun, launcher, detach, force, as_json)
+        _run(name, overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach, force=force,
+             as_json=as_json)  # fmt: skip
 
     command.__doc__ = text
     app.command(name)(command)
 
 
-_stage_command("prepare-assets", "Stage 1: objects, convex parts and settled scenes.")
-_stage_command("train-teacher", "Stage 2: one local grasping teacher, by reinforcement learning.")
-_stage_command("generate-rollouts", "Stage 3: successful whole-body trajectories with rendered observations.")
-_stage_command("distill", "Stage 4: one student that sees point clouds and an instruction.")
-_stage_command("evaluate", "Stage 5: closed-loop success on held-out objects, with a report.")
-_stage_command("deploy-export", "Stage 6: the bundle that runs on the robot.")
+for _name, _text in STAGES.items():
+    _add_stage(_name, _text)
 
 
 @app.command()
 def plan(
     overrides: Overrides = None,
     check: Annotated[bool, typer.Option("--check", help="Exit with 3 when a stage would run.")] = False,
+    until: Until = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """Say which stages would run, and why."""
-    from stages.commands import plan_command
-
-    plan_command(overrides or [], check, as_json)
+    _call("commands", "plan_command", overrides or [], check, as_json, until)
 
 
-Root = Annotated[
-    list[str] | None, typer.Argument(metavar="[OVERRIDE]...", help="artifacts.root=DIR", show_default=False)
-]
+@app.command("repro-diff")
+def repro_diff(items: Items = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Name the first step and tensor that differ."""
+    _call("commands_artifacts", "repro_diff", items or [], as_json)
 
 
-@artifacts_app.command("ls")
-def artifacts_ls(
-    items: Annotated[list[str] | None, typer.Argument(metavar="[KIND[/NAME]]... [artifacts.root=DIR]")] = None,
-    debug: Debug = False,
-    as_json: Json = False,
-) -> None:
+@app.command()
+def doctor(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """What this machine can do, and how to get the rest."""
+    _call("doctor", "doctor", overrides or [], as_json)
+
+
+@app.command()
+def completion(shell: Annotated[str, typer.Argument(help="bash, zsh or fish.")], debug: Debug = False) -> None:
+    """Print a completion script for your shell."""
+    _call("completion", "script", shell)
+
+
+@artifacts_app.command()
+def ls(items: Items = None, debug: Debug = False, as_json: Json = False) -> None:
     """List artifacts."""
-    from stages.commands_artifacts import ls
-
-    ls(items or [], as_json)
+    _call("commands_artifacts", "ls", items or [], as_json)
 
 
-@artifacts_app.command("show")
-def artifacts_show(
-    items: Annotated[list[str], typer.Argument(metavar="ARTIFACT [artifacts.root=DIR]")],
+@artifacts_app.command()
+def show(items: Items = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Settings, inputs, metrics and files of one."""
+    _call("commands_artifacts", "show", items or [], as_json)
+
+
+@artifacts_app.command()
+def why(items: Items = None, debug: Debug = False, as_json: Json = False) -> None:
+    """What it was made from, and what from it."""
+    _call("commands_artifacts", "why", items or [], as_json)
+
+
+@artifacts_app.command()
+def diff(items: Items = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Settings, code, inputs, metrics, files of two."""
+    _call("commands_artifacts", "diff", items or [], as_json)
+
+
+@artifacts_app.command()
+def verify(items: Items = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Find every changed or missing byte."""
+    _call("commands_artifacts", "verify", items or [], as_json)
+
+
+@artifacts_app.command()
+def gc(
+    items: Items = None,
+    delete: Annotated[bool, typer.Option("--delete", help="Delete; without it, only list.")] = False,
+    grace: Annotated[float, typer.Option("--grace", help="Leave alone attempts younger than this (hours).")] = 24.0,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
-    """Show one artifact: settings, inputs, metrics, files."""
-    from stages.commands_artifacts import show
-
-    show(items, as_json)
+    """Delete what no reference or pin reaches."""
+    _call("commands_artifacts", "gc", items or [], delete, grace, as_json)
 
 
-@artifacts_app.command("verify")
-def artifacts_verify(
-    items: Annotated[list[str] | None, typer.Argument(metavar="[ARTIFACT]... [artifacts.root=DIR]")] = None,
+@artifacts_app.command()
+def pin(
+    items: Items = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Take the pin off.")] = False,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
-    """Read every byte and find what changed or is missing."""
-    from stages.commands_artifacts import verify
-
-    verify(items or [], as_json)
+    """Keep out of gc's reach, with its inputs."""
+    _call("commands_artifacts", "pin", items or [], remove, as_json)
 
 
-def main(arguments: list[str] | None = None) -> int:
+@artifacts_app.command()
+def rm(items: Items = None, force: Force = False, debug: Debug = False, as_json: Json = False) -> None:
+    """Delete an artifact that nothing was made from."""
+    _call("commands_artifacts", "rm", items or [], force, as_json)
+
+
+Remote = Annotated[str, typer.Argument(metavar="URL", help="s3://bucket/prefix or a directory.")]
+
+
+@artifacts_app.command()
+def push(url: Remote, items: Items = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Copy artifacts, with inputs, to another store."""
+    _call("commands_artifacts", "transfer", url, items or [], True, as_json)
+
+
+@artifacts_app.command()
+def pull(url: Remote, items: Items = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Copy artifacts, with inputs, from another store."""
+    _call("commands_artifacts", "transfer", url, items or [], False, as_json)
+
+
+def main(arguments: list[str] | None = None) -> None:
     """Entry point. Exit codes: 0 done, 1 failed, 2 usage, 3 stale (`plan --check`)."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    debug = "--debug" in arguments
     try:
+        if arguments[:1] == ["--complete"]:
+            _call("completion", "answer", " ".join(arguments[1:]))
+            sys.exit(0)
         result = app(arguments, prog_name="wbm", standalone_mode=False)
         code = result if isinstance(result, int) else 0  # what typer.Exit carried
     except SystemExit as stop:
-        code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
+        code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     except KeyboardInterrupt:
         code = _complain("interrupted", 1)
     except BrokenPipeError:
         sys.stderr.close()
         code = 1
-    except Exception as error:
-        if debug:
+    except BaseException as error:
+        if "--debug" in arguments:
             raise
         code = _exit_code(error)
     sys.exit(code)
 
 
-def _exit_code(error: Exception) -> int:
-    from typer import Exit
-
-    if isinstance(error, Exit):
-        return error.exit_code
-    if hasattr(error, "exit_code") and hasattr(error, "format_message"):  # a usage error of the vendored click
-        return _complain(error.format_message(), 2)  # pyright: ignore[reportAttributeAccessIssue]
+def _exit_code(error: BaseException) -> int:
     kind = type(error).__name__
+    if hasattr(error, "exit_code") and hasattr(error, "format_message"):  # a usage error of Typer
+        return _complain(error.format_message(), 2)  # pyright: ignore[reportAttributeAccessIssue]
     if kind == "Abort":
         return _complain("interrupted", 1)
     if kind == "ConfigError":

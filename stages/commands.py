@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,33 @@ from typer import Exit
 
 from stages import plan as planning
 from stages import registry
-from stages.compose import Composed, compose, defaults_list, expand, to_yaml
+from stages.compose import Composed, compose, defaults_list, expand, swept_keys, to_yaml
 from stages.config import Config
 from stages.convert import ConfigError
-from stages.pipeline import Outcome, run_node, run_nodes
+from stages.pipeline import Outcome, StageError, run_node, run_nodes
 from stages.progress import Progress
+from stages.tables import results_table, sweep_table
 from wbm.artifacts.digest import plain
+from wbm.artifacts.errors import ArtifactError
 from wbm.artifacts.store import Store
+
+LAUNCHERS = ("local", "slurm")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `wbm run` and the stages; `stage` is None for all of them, `until` the last one to run."""
+
+    stage: str | None
+    overrides: tuple[str, ...]
+    cfg: bool = False
+    info: bool = False
+    multirun: bool = False
+    launcher: str = "local"
+    detach: bool = False
+    force: bool = False
+    as_json: bool = False
+    until: str | None = None
 
 
 def composer(overrides: Sequence[str]) -> Config:
@@ -37,68 +59,95 @@ def emit(document: Any) -> None:
     sys.stdout.write(json.dumps(document, indent=2, default=str) + "\n")
 
 
-def run_command(
-    stage: str | None,
-    overrides: list[str],
-    cfg: bool,
-    info: bool,
-    multirun: bool,
-    launcher: str,
-    detach: bool,
-    force: bool,
-    as_json: bool,
-) -> None:
-    """Run one stage, or all of them when `stage` is None."""
-    if launcher not in ("local", "slurm"):
-        raise ConfigError(f"--launcher {launcher}: choose local or slurm")
-    if detach and launcher == "local":
+def run_command(options: Options) -> None:
+    """Run one stage or the pipeline, once or for each point of a sweep.
+
+    Raises:
+        ConfigError: bad settings or options.
+        StageError: a stage failed.
+    """
+    if options.launcher not in LAUNCHERS:
+        raise ConfigError(f"--launcher {options.launcher}: choose {' or '.join(LAUNCHERS)}")
+    if options.detach and options.launcher == "local":
         raise ConfigError("--detach needs --launcher slurm")
-    if info:
-        sys.stdout.write(defaults_list(overrides) + "\n")
+    _known_stage(options.until)
+    if options.info:
+        sys.stdout.write(defaults_list(options.overrides) + "\n")
         return
-    runs = expand(overrides) if multirun else [overrides]
+    runs = expand(options.overrides) if options.multirun else [list(options.overrides)]
     composed = [compose(lines) for lines in runs]
-    if cfg:
-        _print_config(stage, composed, as_json)
-        return
-    results = [_run_one(stage, list(item.overrides), Progress(), force) for item in composed]
-    if as_json:
-        emit(_document(results[0]) if not multirun else [_document(r) for r in results])
+    if options.cfg:
+        _print_config(options, composed)
+    elif options.launcher == "slurm":
+        importlib.import_module("stages.submit").submit(options, composed)
+    elif options.multirun:
+        _sweep(options, composed)
     else:
-        from stages.tables import results_table
+        outcomes = run_once(options, runs[0])
+        if options.as_json:
+            emit(_document(outcomes))
+        else:
+            sys.stdout.write(results_table(outcomes))
 
-        for result in results:
-            sys.stdout.write(results_table(result))
+
+def _known_stage(name: str | None) -> None:
+    if name is not None and name not in registry.MODULES:
+        raise ConfigError(f"--until {name}: no such stage; there are {', '.join(registry.MODULES)}")
 
 
-def _print_config(stage: str | None, composed: list[Composed], as_json: bool) -> None:
+def _print_config(options: Options, composed: Sequence[Composed]) -> None:
     values = [plain(item.config) for item in composed]
-    if stage is not None:
-        sections = registry.load(stage).sections
+    if options.stage is not None:
+        sections = registry.load(options.stage).sections
         values = [{name: value[name] for name in ("artifacts", *sections)} for value in values]
-    if as_json:
+    if options.as_json:
         emit(values[0] if len(values) == 1 else values)
     else:
         sys.stdout.write("---\n".join(to_yaml(value) for value in values))
 
 
-def _run_one(stage: str | None, overrides: list[str], progress: Progress, force: bool) -> list[Outcome]:
+def run_once(options: Options, overrides: Sequence[str]) -> list[Outcome]:
+    """Run one stage, or the pipeline, under one configuration."""
     store = open_store(composer(overrides))
-    stages = registry.load_all() if stage is None else registry.load_until(stage)
-    if stage is None:
-        return run_nodes(planning.build(stages, overrides, composer, store), store, progress, force=force)
+    progress = Progress()
+    if options.stage is None:
+        stages = registry.load_until(options.until) if options.until else registry.load_all()
+        nodes = planning.build(stages, overrides, composer, store)
+        return run_nodes(nodes, store, progress, force=options.force)
+    stages = registry.load_until(options.stage)
     nodes = planning.single(stages[-1], stages, overrides, composer, store)
     for node in nodes:
         planning.look_up(node, store, use_latest=node is nodes[-1])
     for upstream in nodes[:-1]:
         if upstream.stale and store.latest(upstream.kind, upstream.name):
-            progress.message(
-                f"note: input {upstream.ref} is not up to date ({planning.because(upstream.reasons)}); using the newest"
-            )
-    return [run_node(nodes[-1], store, progress, force=force)]
+            reasons = planning.because(upstream.reasons)
+            progress.message(f"note: input {upstream.ref} is not up to date ({reasons}); using the newest")
+    return [run_node(nodes[-1], store, progress, force=options.force)]
 
 
-def _document(outcomes: list[Outcome]) -> dict[str, Any]:
+def _sweep(options: Options, composed: Sequence[Composed]) -> None:
+    """Run every point; a failed one does not stop the others. One table at the end."""
+    swept = swept_keys(options.overrides)
+    rows = []
+    failed = 0
+    for number, item in enumerate(composed, 1):
+        point = [line for line in item.overrides if line.lstrip("+~").split("=")[0] in swept]
+        Progress().message(f"run {number} of {len(composed)}: {' '.join(point)}")
+        try:
+            rows.append((point, run_once(options, item.overrides), None))
+        except (StageError, ArtifactError) as error:
+            failed += 1
+            rows.append((point, [], str(error)))
+            Progress().message(f"wbm: {error}")
+    if options.as_json:
+        emit([{"overrides": point, "error": error, **_document(outcomes)} for point, outcomes, error in rows])
+    else:
+        sys.stdout.write(sweep_table(rows))
+    if failed:
+        raise StageError(f"{failed} of {len(composed)} runs failed")
+
+
+def _document(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     return {
         "stages": [
             {
@@ -106,6 +155,7 @@ def _document(outcomes: list[Outcome]) -> dict[str, Any]:
                 "artifact": o.manifest.ref,
                 "state": o.state,
                 "seconds": round(o.seconds, 3),
+                "wall_time_s": o.manifest.wall_time_s,
                 "content_digest": o.manifest.content_digest,
                 "metrics": o.manifest.metrics,
             }
@@ -114,29 +164,27 @@ def _document(outcomes: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def plan_command(overrides: list[str], check: bool, as_json: bool) -> None:
+def plan_command(overrides: Sequence[str], check: bool, as_json: bool, until: str | None = None) -> None:
     """Print which stages would run and why; with `check`, exit with 3 when there are any."""
+    _known_stage(until)
     store = open_store(composer(overrides))
-    nodes = planning.plan(planning.build(registry.load_all(), overrides, composer, store), store)
+    stages = registry.load_until(until) if until else registry.load_all()
+    nodes = planning.plan(planning.build(stages, overrides, composer, store), store)
     if as_json:
-        emit(
-            {
-                "stale": any(node.stale for node in nodes),
-                "stages": [
-                    {
-                        "stage": node.stage.name,
-                        "artifact": node.done.ref if node.done else node.ref,
-                        "state": "up to date" if node.done else "would run",
-                        "key": node.key,
-                        "reasons": node.reasons,
-                    }
-                    for node in nodes
-                ],
-            }
-        )
+        emit({"stale": any(node.stale for node in nodes), "stages": [_plan_entry(node) for node in nodes]})
     else:
         for node in nodes:
             state = f"would run {planning.because(node.reasons)}" if node.stale else "up to date"
             sys.stdout.write(f"{node.stage.name:18} {node.ref:24} {state}\n")
     if check and any(node.stale for node in nodes):
         raise Exit(3)
+
+
+def _plan_entry(node: planning.Node) -> dict[str, Any]:
+    return {
+        "stage": node.stage.name,
+        "artifact": node.done.ref if node.done else node.ref,
+        "state": "up to date" if node.done else "would run",
+        "key": node.key,
+        "reasons": node.reasons,
+    }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 KIND = "assets"
-SECTIONS = ("robot", "objects", "scenes")
+SECTIONS = ("seed", "robot", "objects", "scenes")
 INPUTS = ()
 
 

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from wbm.artifacts.digest import digest_bytes
-from wbm.artifacts.errors import Conflict, Missing
+from wbm.artifacts.digest import digest_bytes, digest_file
+from wbm.artifacts.errors import ArtifactError, Conflict, Missing
 from wbm.artifacts.files import exchange, fsync_path, fsync_tree, locked, make_dirs, remove_tree, write_atomic
-from wbm.artifacts.manifest import MANIFEST
+from wbm.artifacts.manifest import MANIFEST, check_files, read_manifest
 
 ABSENT = ""  # expected version of a record that must not exist yet
+Advance = Callable[[float], None]  # told how many bytes were dealt with
+
+
+def ignore(_: float) -> None:
+    """An `Advance` for nobody."""
 
 
 class Backend(Protocol):
@@ -46,6 +53,10 @@ class Backend(Protocol):
         """`kind/name/key12` of every published artifact, sorted."""
         ...
 
+    def strays(self) -> list[str]:
+        """Folders where an artifact should be but that hold no manifest."""
+        ...
+
     def has(self, ref: str) -> bool:
         """Whether an artifact is published."""
         ...
@@ -66,12 +77,29 @@ class Backend(Protocol):
         """
         ...
 
-    def fetch(self, ref: str) -> Path:
+    def fetch(self, ref: str, advance: Advance = ignore) -> Path:
         """Local folder with the artifact's files."""
+        ...
+
+    def receive(self, folder: Path, ref: str, advance: Advance) -> None:
+        """Publish a copy of another store's artifact.
+
+        Raises:
+            ArtifactError: the copy does not agree with its manifest.
+            Conflict: published meanwhile.
+        """
+        ...
+
+    def check(self, ref: str) -> list[str]:
+        """Read every byte of an artifact and return one line for each problem."""
         ...
 
     def remove(self, ref: str) -> None:
         """Unpublish and delete an artifact."""
+        ...
+
+    def sweep(self, grace_s: float) -> int:
+        """Delete contents that no artifact names and that are older than `grace_s` seconds. Returns the bytes freed."""
         ...
 
 
@@ -84,7 +112,7 @@ class LocalBackend:
         self._meta = root / ".store"
 
     def _lock(self, path: str) -> Path:
-        return self._meta / "locks" / digest_bytes(path.encode())[:16]
+        return self._meta / "locks" / digest_bytes(path.encode())[:2]  # 256 locks for any number of records
 
     def read(self, path: str) -> tuple[bytes, str] | None:
         try:
@@ -103,19 +131,24 @@ class LocalBackend:
 
     def delete(self, path: str) -> None:
         with locked(self._lock(path)):
-            (self._meta / path).unlink(missing_ok=True)
+            if (self._meta / path).exists():
+                (self._meta / path).unlink()
+                fsync_path((self._meta / path).parent)
 
     def records(self, prefix: str) -> list[str]:
         base = self._meta / prefix
         paths = base.rglob("*") if base.is_dir() else []
         return sorted(p.relative_to(self._meta).as_posix() for p in paths if p.is_file() and p.name[0] != ".")
 
+    def _all_folders(self) -> list[str]:
+        kinds = [kind for kind in _folders(self.work) if kind.name != "reference"]
+        return sorted(f"{kind.name}/{n.name}/{k.name}" for kind in kinds for n in _folders(kind) for k in _folders(n))
+
     def artifacts(self) -> list[str]:
-        found = []
-        for kind in _folders(self.work):
-            if kind.name != "reference":
-                found += [f"{kind.name}/{n.name}/{k.name}" for n in _folders(kind) for k in _folders(n)]
-        return sorted(ref for ref in found if self.has(ref))
+        return [ref for ref in self._all_folders() if self.has(ref)]
+
+    def strays(self) -> list[str]:
+        return [ref for ref in self._all_folders() if not self.has(ref)]
 
     def has(self, ref: str) -> bool:
         return (self.work / ref / MANIFEST).is_file()
@@ -145,16 +178,54 @@ class LocalBackend:
                     os.rename(staged, target)
                     os.rename(aside, staged)
             else:
-                os.rename(staged, target)
+                _rename(staged, target)
             fsync_path(target.parent)
             fsync_path(staged.parent)
 
-    def fetch(self, ref: str) -> Path:
-        return self.work / ref
+    def fetch(self, ref: str, advance: Advance = ignore) -> Path:
+        folder = self.work / ref
+        advance(sum(entry.size for entry in read_manifest(folder).files))
+        return folder
+
+    def receive(self, folder: Path, ref: str, advance: Advance) -> None:
+        incoming = self.work / ".staging" / f"{ref}.incoming"
+        manifest = read_manifest(folder)
+        make_dirs(incoming)
+        for entry in manifest.files:
+            path = incoming / entry.path
+            if not (path.is_file() and path.stat().st_size == entry.size and digest_file(path) == entry.digest):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(folder / entry.path, path)
+                if digest_file(path) != entry.digest:
+                    raise ArtifactError(f"{ref}: {entry.path} has changed in {folder}")
+            advance(entry.size)
+        shutil.copyfile(folder / MANIFEST, incoming / MANIFEST)
+        self.publish(incoming, ref, replace=self.has(ref), guard=lambda: None)
+        remove_tree(incoming)
+
+    def check(self, ref: str) -> list[str]:
+        return check_files(read_manifest(self.work / ref), self.work / ref)
 
     def remove(self, ref: str) -> None:
         with locked(self._lock(f"artifact/{ref}")):
             remove_tree(self.work / ref)
+
+    def sweep(self, grace_s: float) -> int:
+        before = time.time() - grace_s
+        doomed = [p for p in self.work.glob("*/*/.*.doomed") if p.stat().st_mtime <= before]
+        freed = sum(f.stat().st_size for folder in doomed for f in folder.rglob("*") if f.is_file())
+        for folder in doomed:
+            shutil.rmtree(folder)
+        return freed
+
+
+def _rename(staged: Path, target: Path) -> None:
+    """Rename, believing the result rather than the error: NFS reports a repeated request as a failure."""
+    try:
+        os.rename(staged, target)
+    except OSError:
+        if staged.exists() or not (target / MANIFEST).is_file():
+            raise
 
 
 def _folders(base: Path) -> list[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
@@ -14,6 +15,8 @@ from wbm.artifacts.digest import canonical_json, digest_bytes, digest_content, d
 from wbm.artifacts.errors import ArtifactError
 
 SCHEMA_VERSION = 1
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+KEY = re.compile(r"[0-9a-f]{12,64}")
 MANIFEST = "manifest.json"
 LOGS = "logs/"  # listed and verified, but no part of the content: logs hold times and host names
 
@@ -100,7 +103,21 @@ def parse_manifest(data: bytes, where: str) -> Manifest:
     record = {name: value for name, value in record.items() if name in known}
     record["inputs"] = {slot: InputRef(*ref) for slot, ref in record["inputs"].items()}
     record["files"] = tuple(FileEntry(*entry) for entry in record["files"])
-    return Manifest(**record)
+    manifest = Manifest(**record)
+    _check_names(manifest, where)
+    return manifest
+
+
+def _check_names(manifest: Manifest, where: str) -> None:
+    """An artifact from a stranger is data: no name in it may lead out of its folder."""
+    if not NAME.fullmatch(manifest.kind) or not NAME.fullmatch(manifest.name) or not KEY.fullmatch(manifest.key):
+        raise ArtifactError(f"{where}: manifest.json holds a name or key that is not allowed; do not use this artifact")
+    for entry in manifest.files:
+        parts = entry.path.split("/")
+        if ".." in parts or "" in parts or "." in parts or "\\" in entry.path or "\0" in entry.path:
+            raise ArtifactError(f"{where}: manifest.json lists the path {entry.path!r}; do not use this artifact")
+        if not KEY.fullmatch(entry.digest) or entry.path == MANIFEST:
+            raise ArtifactError(f"{where}: manifest.json has a bad entry for {entry.path!r}; do not use this artifact")
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -155,13 +172,12 @@ def seal(manifest: Manifest, folder: Path) -> Manifest:
     return replace(manifest, files=files, content_digest=digest_payload(payload))
 
 
-def check_files(manifest: Manifest, folder: Path, *, deep: bool = True) -> list[str]:
+def check_files(manifest: Manifest, folder: Path) -> list[str]:
     """Compare the files of `folder` with the manifest.
 
     Args:
         manifest: what should be there.
         folder: where it should be.
-        deep: read every byte; otherwise only names and sizes.
 
     Returns:
         One line for each missing, changed or unlisted file; empty when all is well.
@@ -175,7 +191,7 @@ def check_files(manifest: Manifest, folder: Path, *, deep: bool = True) -> list[
             problems.append(f"{manifest.ref}: {name} is missing")
         elif path.stat().st_size != entry.size:
             problems.append(f"{manifest.ref}: {name} has {path.stat().st_size} bytes instead of {entry.size}")
-        elif deep and digest_file(path) != entry.digest:
+        elif digest_file(path) != entry.digest:
             problems.append(f"{manifest.ref}: {name} has changed")
     problems.extend(f"{manifest.ref}: {name} is not in the manifest" for name in sorted(found.keys() - listed.keys()))
     payload = [(e.path, e.content or e.digest) for e in manifest.files if not e.path.startswith(LOGS)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import time
 from collections.abc import Iterable
@@ -18,11 +17,9 @@ from wbm.artifacts.digest import KEY_LENGTH
 from wbm.artifacts.errors import ArtifactError, Conflict, Missing
 from wbm.artifacts.files import fsync_path, make_dirs, remove_tree
 from wbm.artifacts.lease import Lease, acquire, is_live
-from wbm.artifacts.manifest import MANIFEST, Manifest, check_files, parse_manifest, read_manifest, seal
+from wbm.artifacts.manifest import MANIFEST, NAME, Manifest, check_files, parse_manifest, read_manifest, seal
 
 KINDS = ("assets", "teacher", "rollouts", "student", "evaluation", "bundle")
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_KEY = re.compile(r"[0-9a-f]{12,64}")
 _RETRIES = 1000
 
 
@@ -193,7 +190,7 @@ class Store:
             Conflict: another process is writing it, or it is published already.
             ArtifactError: a bad name, or a root that cannot be written.
         """
-        if not _NAME.fullmatch(manifest.kind) or not _NAME.fullmatch(manifest.name):
+        if not NAME.fullmatch(manifest.kind) or not NAME.fullmatch(manifest.name):
             raise ArtifactError(
                 f"{manifest.kind}/{manifest.name}: names hold letters, digits, dot, dash and underscore"
             )
@@ -228,18 +225,37 @@ class Store:
         fsync_path(target.parent)
         return target
 
-    def verify(self, refs: Iterable[str] | None = None, *, deep: bool = True) -> list[str]:
-        """Problems of the named artifacts (default: all): one line for each missing, changed or unlisted file."""
-        problems = []
+    def verify(self, refs: Iterable[str] | None = None) -> list[str]:
+        """Problems of the named artifacts: one line for each missing, changed or unlisted file.
+
+        Without names, of all of them, and of references to artifacts that are gone.
+        """
+        problems = [] if refs is not None else self.dangling()
         for ref in self.names() if refs is None else refs:
             try:
-                artifact = self.resolve(ref)
-                problems += check_files(artifact.manifest, artifact.path, deep=deep)
-                if not ref.startswith("reference/") and artifact.ref != self._expand(ref):
-                    problems.append(f"{ref}: the manifest belongs to {artifact.ref}")
+                if ref.startswith("reference/"):
+                    artifact = self.resolve(ref)
+                    problems += check_files(artifact.manifest, artifact.path)
+                    continue
+                name = self._expand(ref)
+                problems += self.backend.check(name)
+                if self.manifest(name).ref != name:
+                    problems.append(f"{name}: the manifest belongs to {self.manifest(name).ref}")
             except (ArtifactError, OSError) as error:
                 problems.append(str(error) if str(error).startswith(ref) else f"{ref}: {error}")
         return problems
+
+    def dangling(self) -> list[str]:
+        """Artifacts without a manifest, and references and pins of artifacts that are gone; a line for each."""
+        problems = [f"{ref}: manifest.json is missing" for ref in self.backend.strays()]
+        known = set(self.names())
+        for path in self.backend.records("refs"):
+            kind, name = path.split("/")[1:3]
+            found = self.backend.read(path)
+            ref = f"{kind}/{name}/{json.loads(found[0])['key'][:KEY_LENGTH]}" if found else ""
+            if found and ref not in known:
+                problems.append(f"{path}: points to {ref}, which is gone")
+        return problems + [f"pins/{ref}: the pinned artifact is gone" for ref in self.pins() if ref not in known]
 
     def pin(self, text: str, *, remove: bool = False) -> str:
         """Keep an artifact, and what it was made from, out of `gc`'s reach; or stop doing so. Returns its full name."""
@@ -268,16 +284,16 @@ class Store:
             if users:
                 raise Conflict(f"{ref}: {users[0]} was made from it; add --force to delete it all the same")
         kind, name, key = ref.split("/")
-        self.backend.remove(ref)
         self.backend.delete(f"pins/{ref}")
         found = self.backend.read(f"refs/{kind}/{name}/latest")
         if found and json.loads(found[0])["key"][:KEY_LENGTH] == key:
-            left = [self.manifest(r) for r in self.names(kind) if r.startswith(f"{kind}/{name}/")]
+            left = [self.manifest(r) for r in self.names(kind) if r.startswith(f"{kind}/{name}/") and r != ref]
             if left:
                 newest = max(left, key=lambda m: m.created)
                 self.set_latest(kind, name, newest.key)
             else:
                 self.backend.delete(f"refs/{kind}/{name}/latest")
+        self.backend.remove(ref)  # after the reference, which must never point to nothing
         return ref
 
     def stale_staging(self, grace_s: float) -> list[Path]:
@@ -291,13 +307,20 @@ class Store:
                     found.append(path)
         return found
 
+    def forget_leases(self) -> None:
+        """Delete the records of leases that nobody holds and whose attempt left nothing behind."""
+        for path in self.backend.records("leases"):
+            staging = self.backend.work / ".staging" / path.removeprefix("leases/")
+            if not is_live(self.backend, path) and not staging.exists():
+                self.backend.delete(path)
+
     def drop_folder(self, folder: Path) -> None:
         """Delete a staging or quarantine folder."""
         remove_tree(folder)
 
     def _expand(self, text: str) -> str:
         parts = text.strip("/").split("/")
-        if len(parts) == 1 and _NAME.fullmatch(parts[0]):
+        if len(parts) == 1 and NAME.fullmatch(parts[0]):
             names = sorted({ref.split("/")[1] for ref in self.names(parts[0])})
             if len(names) != 1:
                 hint = (
@@ -305,7 +328,7 @@ class Store:
                 )
                 raise Missing(f"{text}: {'ambiguous' if names else 'nothing published'}; {hint}")
             parts.append(names[0])
-        if len(parts) not in (2, 3) or not all(_NAME.fullmatch(p) for p in parts):
+        if len(parts) not in (2, 3) or not all(NAME.fullmatch(p) for p in parts):
             raise Missing(f"{text}: not an artifact; write kind/name, kind/name/key or reference/name")
         kind, name = parts[:2]
         if len(parts) == 2 or parts[2] == "latest":

@@ -61,13 +61,22 @@ def unpack(path: Path, allowed: frozenset[str]) -> dict[str, bytes]:
             name = info.filename
             # A name is a plain file name: no folders, no drive, no parent, so nothing can leave a directory.
             if name in ("", ".", "..") or any(c in name for c in "/\\:\0"):
-                raise BundleError(Fault.UNSAFE_PATH, f"{path} holds a member named {name!r}; the bundle must not be trusted")
+                raise BundleError(
+                    Fault.UNSAFE_PATH, f"{path} holds a member named {name!r}; the bundle must not be trusted"
+                )
             if name in members or name not in allowed:
-                raise BundleError(Fault.UNKNOWN_MEMBER, f"{path} holds {name!r} {'twice' if name in members else ''}; expected {sorted(allowed)}")
+                raise BundleError(
+                    Fault.UNKNOWN_MEMBER,
+                    f"{path} holds {name!r} {'twice' if name in members else ''}; expected {sorted(allowed)}",
+                )
             if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
-                raise BundleError(Fault.NOT_A_BUNDLE, f"{path}: member {name} is compressed; bundles store members as they are")
+                raise BundleError(
+                    Fault.NOT_A_BUNDLE, f"{path}: member {name} is compressed; bundles store members as they are"
+                )
             if info.file_size > MAX_MEMBER.get(name, MAX_JSON):
-                raise BundleError(Fault.TOO_LARGE, f"{path}: member {name} has {info.file_size} bytes, more than is read")
+                raise BundleError(
+                    Fault.TOO_LARGE, f"{path}: member {name} has {info.file_size} bytes, more than is read"
+                )
             try:
                 members[name] = archive.read(info)
             except (zipfile.BadZipFile, OSError, EOFError, ValueError) as error:
@@ -87,7 +96,10 @@ def _check_seal(path: Path, data: bytes) -> None:
     if digest != hashlib.sha256(data[:-_SEAL_SIZE]).hexdigest().encode():
         raise BundleError(Fault.CHECKSUM, f"{path} does not match its seal: bytes were changed; fetch it again")
     if version != b"%d" % VERSION:
-        raise BundleError(Fault.BUNDLE_VERSION, f"{path} has container version {version.decode(errors='replace')}, this runtime reads {VERSION}")
+        raise BundleError(
+            Fault.BUNDLE_VERSION,
+            f"{path} has container version {version.decode(errors='replace')}, this runtime reads {VERSION}",
+        )
 
 
 def save_arrays(arrays: dict[str, np.ndarray]) -> bytes:

@@ -123,7 +123,9 @@ class Bundle:
         sums = _load_json(members["checksums.json"], "checksums.json", Fault.CHECKSUM)
         expected = set(_REQUIRED) - {"checksums.json"}
         if set(sums) != expected:
-            raise BundleError(Fault.CHECKSUM, f"{path}: checksums.json lists {sorted(sums)}, expected {sorted(expected)}")
+            raise BundleError(
+                Fault.CHECKSUM, f"{path}: checksums.json lists {sorted(sums)}, expected {sorted(expected)}"
+            )
         for name, digest in sums.items():
             if hashlib.sha256(members[name]).hexdigest() != digest:
                 raise BundleError(Fault.CHECKSUM, f"{path}: {name} does not match its checksum; fetch the bundle again")
@@ -149,7 +151,9 @@ class Bundle:
         arrays = load_arrays(self._members["golden.npz"], "golden.npz")
         if "output/action" not in arrays or arrays["output/action"].shape[1:] != (self.contract.schema.action.size,):
             raise BundleError(Fault.CONTRACT, "golden.npz lacks output/action [G,32]")
-        return {k.removeprefix("input/"): v for k, v in arrays.items() if k.startswith("input/")}, arrays["output/action"]
+        return {k.removeprefix("input/"): v for k, v in arrays.items() if k.startswith("input/")}, arrays[
+            "output/action"
+        ]
 
     def policy(self, threads: int = 1) -> OnnxPolicy:
         """The network, ready to run."""
@@ -177,10 +181,14 @@ class Bundle:
             raise BundleError(Fault.GOLDEN, f"golden.npz: {error}") from error
         tolerance = self.contract.data["parity_tolerance"]
         if answer.shape != action.shape or not np.isfinite(action).all():
-            raise BundleError(Fault.GOLDEN, f"golden.npz: expected actions {action.shape}, the model answers {answer.shape}")
+            raise BundleError(
+                Fault.GOLDEN, f"golden.npz: expected actions {action.shape}, the model answers {answer.shape}"
+            )
         parity = float(max(np.abs(answer - action).max(), np.abs(single - action[:1]).max()))
         if parity > tolerance:
-            raise BundleError(Fault.GOLDEN, f"the model differs from its golden vectors by {parity:.3g}, allowed {tolerance:.3g}")
+            raise BundleError(
+                Fault.GOLDEN, f"the model differs from its golden vectors by {parity:.3g}, allowed {tolerance:.3g}"
+            )
         return {
             "parity": parity,
             "tolerance": tolerance,
@@ -201,7 +209,8 @@ class Bundle:
             "size_bytes": {k: len(v) for k, v in sorted(self._members.items())},
             "rate_hz": c.schema.rate_hz,
             "observation": [
-                {"name": f.name, "shape": list(f.shape), "dtype": f.dtype, "unit": f.unit, "frame": f.frame} for f in c.schema.observation
+                {"name": f.name, "shape": list(f.shape), "dtype": f.dtype, "unit": f.unit, "frame": f.frame}
+                for f in c.schema.observation
             ],
             "action": {"size": c.schema.action.size, "limit": c.schema.action.limit, "joints": list(c.joint_names)},
             "delays": c.data["delays"],

@@ -101,7 +101,9 @@ CONTRACT_SCHEMA: dict[str, Any] = _object(
         "frames": {"type": "object", "additionalProperties": _FRAME},
         "sensors": _object(
             {
-                "camera": _object({"frame": {"const": "camera"}, "max_range_m": _POSITIVE, "min_range_m": _NOT_NEGATIVE}),
+                "camera": _object(
+                    {"frame": {"const": "camera"}, "max_range_m": _POSITIVE, "min_range_m": _NOT_NEGATIVE}
+                ),
                 "lidar": _object({"frame": {"const": "lidar"}, "max_range_m": _POSITIVE, "min_range_m": _NOT_NEGATIVE}),
             }
         ),
@@ -152,7 +154,9 @@ class Contract:
         """
         version = data.get("format_version") if isinstance(data, dict) else None
         if version != FORMAT_VERSION:
-            raise BundleError(Fault.BUNDLE_VERSION, f"contract has format version {version}, this runtime reads {FORMAT_VERSION}")
+            raise BundleError(
+                Fault.BUNDLE_VERSION, f"contract has format version {version}, this runtime reads {FORMAT_VERSION}"
+            )
         try:
             validate(data, CONTRACT_SCHEMA)
             _check_meaning(data)
@@ -160,7 +164,9 @@ class Contract:
             _check_fields(data, schema)
         except (ValueError, KeyError, TypeError) as error:
             raise BundleError(Fault.CONTRACT, str(error)) from error
-        arrays = {k: np.array(data["joints"][k], dtype=np.float64) for k in ("q_min", "q_max", "qd_max", "qdd_max", "q_home")}
+        arrays = {
+            k: np.array(data["joints"][k], dtype=np.float64) for k in ("q_min", "q_max", "qd_max", "qdd_max", "q_home")
+        }
         return Contract(data, schema, **arrays)
 
 
@@ -171,7 +177,9 @@ def _check_meaning(data: dict[str, Any]) -> None:
         raise ValueError("contract.joints.names must be 32 different names in the order of the action")
     for i, name in enumerate(block["names"]):
         if not block["q_min"][i] < block["q_max"][i]:
-            raise ValueError(f"contract.joints: {name} has q_min {block['q_min'][i]} not below q_max {block['q_max'][i]}")
+            raise ValueError(
+                f"contract.joints: {name} has q_min {block['q_min'][i]} not below q_max {block['q_max'][i]}"
+            )
         if not (block["qd_max"][i] > 0 and block["qdd_max"][i] > 0 and data["policy"]["action"]["scale"][i] > 0):
             raise ValueError(f"contract.joints: {name} needs positive velocity, acceleration and action scale")
     for i, link in enumerate(data["tree"]):
@@ -197,7 +205,9 @@ def _check_fields(data: dict[str, Any], schema: PolicySchema) -> None:
                 raise ValueError(f"contract.policy.observation {field.name!r} has another {key} than this version")
         for key in ("dtype", "unit", "frame"):
             if stored[key] != getattr(field, key):
-                raise ValueError(f"contract.policy.observation {field.name!r} has {key} {stored[key]!r}, expected {getattr(field, key)!r}")
+                raise ValueError(
+                    f"contract.policy.observation {field.name!r} has {key} {stored[key]!r}, expected {getattr(field, key)!r}"
+                )
 
 
 def make_contract(
@@ -231,7 +241,9 @@ def make_contract(
     ]
     policy = schema.to_dict()
     policy["action"] = {k: list(v) if isinstance(v, tuple) else v for k, v in policy["action"].items()}
-    policy["observation"] = [{**f, "shape": list(f["shape"]), "labels": list(f["labels"])} for f in policy["observation"]]
+    policy["observation"] = [
+        {**f, "shape": list(f["shape"]), "labels": list(f["labels"])} for f in policy["observation"]
+    ]
     data = {
         "format_version": FORMAT_VERSION,
         "name": name,
@@ -243,14 +255,20 @@ def make_contract(
             **{k: getattr(robot, k).tolist() for k in ("q_min", "q_max", "qd_max", "qdd_max", "q_home")},
         },
         "tree": tree,
-        "frames": {k: {"link": int(f.link), "pos": f.pos.tolist(), "quat": f.quat.tolist()} for k, f in robot.frames.items()},
+        "frames": {
+            k: {"link": int(f.link), "pos": f.pos.tolist(), "quat": f.quat.tolist()} for k, f in robot.frames.items()
+        },
         "sensors": {
             "camera": {"frame": "camera", "max_range_m": cfg.range_camera_m, "min_range_m": cfg.range_min_m},
             "lidar": {"frame": "lidar", "max_range_m": cfg.range_lidar_m, "min_range_m": cfg.range_min_m},
         },
         "delays": {"joints_s": cfg.delay_joints_s, "depth_s": cfg.delay_cloud_s, "lidar_s": cfg.delay_cloud_s},
         "max_age": {"joints_s": cfg.max_age_joints_s, "depth_s": cfg.max_age_cloud_s, "lidar_s": cfg.max_age_cloud_s},
-        "tolerances": {"limit": cfg.limit_tolerance, "velocity_factor": cfg.velocity_factor, "consistency": cfg.consistency},
+        "tolerances": {
+            "limit": cfg.limit_tolerance,
+            "velocity_factor": cfg.velocity_factor,
+            "consistency": cfg.consistency,
+        },
         "workspace": {"base_box_m": cfg.base_box_m, "floor_clearance_m": cfg.floor_clearance_m, "reach_m": cfg.reach_m},
         "normalisers": {
             k: {"mean": np.ravel(m).tolist(), "std": np.ravel(s).tolist(), "applied": "inside policy.onnx"}

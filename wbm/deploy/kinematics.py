@@ -5,21 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wbm.deploy.contract import Contract
-from wbm.robot import joints
-from wbm.robot.schema import rot6d
-
-_TIPS = tuple(f"tip_{f}" for f in joints.FINGERS)
-
-
-def _quat_to_mat(quat: np.ndarray) -> np.ndarray:
-    w, x, y, z = quat
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+from wbm.robot.proprio import FRAMES, proprioception, quat_to_mat
 
 
 class Kinematics:
@@ -30,7 +16,7 @@ class Kinematics:
 
     def __init__(self, contract: Contract) -> None:
         tree, frames = contract.data["tree"], contract.data["frames"]
-        wanted = {frames[n]["link"] for n in ("ee", "camera", "lidar", "base", *_TIPS)}
+        wanted = {frames[n]["link"] for n in (*FRAMES, "lidar")}
         for i in range(len(tree) - 1, 0, -1):
             if i in wanted:
                 wanted.add(tree[i]["parent"])
@@ -40,9 +26,23 @@ class Kinematics:
             axis = np.array(link["axis"])
             skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
             self._links.append(
-                (i, link["parent"], np.array(link["pos"]), _quat_to_mat(np.array(link["quat"])), link["type"], axis, skew, skew @ skew, link["joint"])
+                (
+                    i,
+                    link["parent"],
+                    np.array(link["pos"]),
+                    quat_to_mat(np, np.array(link["quat"])),
+                    link["type"],
+                    axis,
+                    skew,
+                    skew @ skew,
+                    link["joint"],
+                )
             )
-        self._frames = {n: (f["link"], np.array(f["pos"]), _quat_to_mat(np.array(f["quat"]))) for n, f in frames.items() if f["link"] in wanted}
+        self._frames = {
+            n: (f["link"], np.array(f["pos"]), quat_to_mat(np, np.array(f["quat"])))
+            for n, f in frames.items()
+            if f["link"] in wanted
+        }
         self._num_links = len(tree)
 
     def frames(self, q: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -59,22 +59,30 @@ class Kinematics:
             rot[i], pos[i] = r, p
         return {n: (rot[link] @ r, pos[link] + rot[link] @ p) for n, (link, p, r) in self._frames.items()}
 
+    def proprio(self, q: np.ndarray, qd: np.ndarray, frames: dict[str, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """The `proprio` field of one step, float32, by the function that training uses.
 
-def proprioception(q: np.ndarray, qd: np.ndarray, frames: dict[str, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """The `proprio` field of one step, float32, in the order of `PROPRIO_LABELS`.
+        Args:
+            q: joint positions [32].
+            qd: joint velocities [32]; the base's first two are velocities in the world.
+            frames: `frames(q)`.
+        """
+        quat = np.array([[mat_to_quat(frames[n][0]) for n in FRAMES]])
+        pos = np.array([[frames[n][1] for n in FRAMES]])
+        return proprioception(np, q[None], qd[None], pos, quat)[0].astype(np.float32)
 
-    Args:
-        q: joint positions [32].
-        qd: joint velocities [32]; the base's first two are velocities in the world.
-        frames: `Kinematics.frames(q)`.
-    """
-    rot_b, pos_b = frames["base"]
-    rot_e, pos_e = frames["ee"]
-    c, s = np.cos(q[2]), np.sin(q[2])
-    twist = (c * qd[0] + s * qd[1], -s * qd[0] + c * qd[1], qd[2])
-    parts = [q[3:], twist, qd[3:]]
-    for name in ("ee", "camera"):
-        rot, pos = frames[name]
-        parts += [rot_b.T @ (pos - pos_b), rot6d(rot_b.T @ rot)]
-    parts += [rot_e.T @ (frames[name][1] - pos_e) for name in _TIPS]
-    return np.concatenate(parts).astype(np.float32)
+
+def mat_to_quat(rot: np.ndarray) -> np.ndarray:
+    """Unit quaternion (w x y z) of a rotation matrix, by its largest component (Shepperd 1978)."""
+    (a, b, c), (d, e, f), (g, h, i) = rot.tolist()
+    trace = a + e + i
+    largest = max(trace, a, e, i)
+    if largest == trace:
+        quat = (1 + trace, h - f, c - g, d - b)
+    elif largest == a:
+        quat = (h - f, 1 + a - e - i, d + b, g + c)
+    elif largest == e:
+        quat = (c - g, d + b, 1 + e - i - a, h + f)
+    else:
+        quat = (d - b, g + c, h + f, 1 + i - a - e)
+    return np.array(quat) / np.sqrt(sum(x * x for x in quat))

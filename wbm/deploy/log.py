@@ -34,12 +34,19 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
                 "type": "array",
                 "items": {
                     "type": "object",
-                    "properties": {"name": {"type": "string"}, "position": {"type": "number"}, "velocity": {"type": "number"}},
+                    "properties": {
+                        "name": {"type": "string"},
+                        "position": {"type": "number"},
+                        "velocity": {"type": "number"},
+                    },
                 },
             },
         },
     ),
-    "/policy/action": ("wbm.Command", {"timestamp": _STAMP, "action": _NUMBERS, "q_target": _NUMBERS, "qd_target": _NUMBERS}),
+    "/policy/action": (
+        "wbm.Command",
+        {"timestamp": _STAMP, "action": _NUMBERS, "q_target": _NUMBERS, "qd_target": _NUMBERS},
+    ),
     "/log": (
         "foxglove.Log",
         {"timestamp": _STAMP, "level": {"type": "integer"}, "message": {"type": "string"}, "name": {"type": "string"}},
@@ -52,7 +59,9 @@ INFO, WARNING = 2, 3  # foxglove.Log levels
 def encode_arrays(arrays: dict[str, np.ndarray]) -> bytes:
     """Arrays as one message, bit for bit: header length (uint32), JSON header, then the raw bytes in order."""
     header = json.dumps({k: [v.dtype.str, list(v.shape)] for k, v in arrays.items()}).encode()
-    return b"".join([struct.pack("<I", len(header)), header, *(np.ascontiguousarray(v).tobytes() for v in arrays.values())])
+    return b"".join(
+        [struct.pack("<I", len(header)), header, *(np.ascontiguousarray(v).tobytes() for v in arrays.values())]
+    )
 
 
 def decode_arrays(data: bytes) -> dict[str, np.ndarray]:
@@ -97,7 +106,9 @@ class RunLog:
         self._channels = {}
         for topic, (name, properties) in _SCHEMAS.items():
             schema = json.dumps({"title": name, "type": "object", "properties": properties}).encode()
-            self._channels[topic] = self._writer.register_channel(topic, "json", self._writer.register_schema(name, "jsonschema", schema))
+            self._channels[topic] = self._writer.register_channel(
+                topic, "json", self._writer.register_schema(name, "jsonschema", schema)
+            )
         self._observations = observations
         if observations:
             self._channels[_OBSERVATION] = self._writer.register_channel(_OBSERVATION, "wbm-arrays", 0)
@@ -107,7 +118,9 @@ class RunLog:
     def __enter__(self) -> RunLog:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def reading(self, reading: Reading) -> None:
@@ -120,7 +133,9 @@ class RunLog:
 
     def command(self, command: Command, observation: dict[str, np.ndarray]) -> None:
         """Log what was commanded and, if wished, what the network saw."""
-        values = {k: np.asarray(getattr(command, k), dtype=np.float64).tolist() for k in ("action", "q_target", "qd_target")}
+        values = {
+            k: np.asarray(getattr(command, k), dtype=np.float64).tolist() for k in ("action", "q_target", "qd_target")
+        }
         self._json("/policy/action", command.stamp, values)
         if self._observations:
             answer = {**observation, "action": np.asarray(command.action, dtype=np.float32)}
@@ -183,7 +198,9 @@ def recover(partial: str | Path, path: str | Path) -> int:
             if kind == "Schema" and record.id not in schemas:
                 schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
             elif kind == "Channel" and record.id not in channels:
-                channels[record.id] = writer.register_channel(record.topic, record.message_encoding, schemas[record.schema_id], record.metadata)
+                channels[record.id] = writer.register_channel(
+                    record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                )
             elif kind == "Message":
                 writer.add_message(channels[record.channel_id], record.log_time, record.data, record.publish_time)
                 count += 1

@@ -54,7 +54,9 @@ def timing_summary(compute_s: np.ndarray, start_s: np.ndarray) -> dict[str, floa
     }
 
 
-def run_loop(driver: Driver, runtime: PolicyRuntime, steps: int, log: RunLog | None = None, max_refusals: int = 25) -> LoopReport:
+def run_loop(
+    driver: Driver, runtime: PolicyRuntime, steps: int, log: RunLog | None = None, max_refusals: int = 25
+) -> LoopReport:
     """Run the policy in closed loop.
 
     A refusal never reaches the driver as a command: the driver is told to hold, and the loop goes on with the next reading.
@@ -116,10 +118,13 @@ def measure_latency(runtime: PolicyRuntime, driver: Driver, steps: int = 1000, w
         reading = driver.read()
         now = driver.now()
         c0, w0 = time.process_time(), time.perf_counter()
-        command = runtime.step(reading, now)
+        try:
+            driver.command(runtime.step(reading, now))
+        except Refused as refused:  # a robot without a plan may leave its workspace; that step was computed all the same
+            driver.hold(refused.fault.value)
+            runtime.recover()
         if i >= warmup:
             cpu[i - warmup], wall[i - warmup] = time.process_time() - c0, time.perf_counter() - w0
-        driver.command(command)
     return {
         "steps": steps,
         "cpu_p50_s": float(np.percentile(cpu, 50)),

@@ -31,7 +31,9 @@ class OnnxPolicy:
         try:
             self._session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own classes share no base but Exception
-            raise BundleError(Fault.ONNX_SIGNATURE, f"policy.onnx cannot be loaded: {str(error).splitlines()[0]}") from error
+            raise BundleError(
+                Fault.ONNX_SIGNATURE, f"policy.onnx cannot be loaded: {str(error).splitlines()[0]}"
+            ) from error
         self.schema = schema
         self._fields = schema.observation
         found = {i.name: (i.type, tuple(i.shape)) for i in self._session.get_inputs()}
@@ -45,7 +47,8 @@ class OnnxPolicy:
         outputs = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
         if found or "action" not in outputs or outputs["action"][1:] != (schema.action.size,):
             raise BundleError(
-                Fault.ONNX_SIGNATURE, f"policy.onnx has extra inputs {sorted(found)} and outputs {outputs}; expected output 'action' [batch, 32]"
+                Fault.ONNX_SIGNATURE,
+                f"policy.onnx has extra inputs {sorted(found)} and outputs {outputs}; expected output 'action' [batch, 32]",
             )
 
     def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:

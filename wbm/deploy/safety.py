@@ -40,6 +40,7 @@ class SafetyFilter:
         """Forget the past; the next reading starts a new episode."""
         self._last: Reading | None = None
         self._origin: np.ndarray | None = None
+        self._low, self._high = self.contract.q_min.copy(), self.contract.q_max.copy()
         self._q_cmd: np.ndarray | None = None
         self._v_cmd = np.zeros(len(self._names))
 
@@ -61,21 +62,36 @@ class SafetyFilter:
         self._check_clouds(reading)
         if self._origin is None:
             self._origin = np.array(reading.q[:2], dtype=np.float64)
-            self._q_cmd = np.clip(np.asarray(reading.q, dtype=np.float64), self.contract.q_min, self.contract.q_max)
+            half = self.contract.data["workspace"][
+                "base_box_m"
+            ]  # the base brakes at the box's wall as at a joint limit
+            self._low[:2] = np.maximum(self._low[:2], self._origin - half)
+            self._high[:2] = np.minimum(self._high[:2], self._origin + half)
+            self._q_cmd = np.clip(np.asarray(reading.q, dtype=np.float64), self._low, self._high)
         self._last = reading
 
     def _check_form(self, reading: Reading) -> None:
         if reading.joint_names is None:
             raise Refused(Fault.DROPPED, "reading has no joint names")
         if tuple(reading.joint_names) != self._names:
-            wrong = next((f"{a} where {b} is expected" for a, b in zip(reading.joint_names, self._names, strict=False) if a != b), "length")
+            wrong = next(
+                (
+                    f"{a} where {b} is expected"
+                    for a, b in zip(reading.joint_names, self._names, strict=False)
+                    if a != b
+                ),
+                "length",
+            )
             raise Refused(Fault.WRONG_ORDER, f"joint order differs from the contract: {wrong}")
         for name, shape in self._shapes.items():
             array = getattr(reading, name)
             if array is None:
                 raise Refused(Fault.DROPPED, f"reading has no {name}")
             if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-                raise Refused(Fault.WRONG_TYPE, f"{name} is {getattr(array, 'dtype', type(array).__name__)}, expected numbers in an array")
+                raise Refused(
+                    Fault.WRONG_TYPE,
+                    f"{name} is {getattr(array, 'dtype', type(array).__name__)}, expected numbers in an array",
+                )
             if array.shape != shape:
                 raise Refused(Fault.WRONG_SHAPE, f"{name} has shape {array.shape}, expected {shape}")
             if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -95,9 +111,14 @@ class SafetyFilter:
             if not math.isfinite(stamp):
                 raise Refused(Fault.NOT_FINITE, f"stamp of {sensor} is {stamp}")
             if stamp > now + _CLOCK_SLACK_S:
-                raise Refused(Fault.FUTURE_STAMP, f"{sensor} was measured {stamp - now:.3f} s after now; check the clocks")
+                raise Refused(
+                    Fault.FUTURE_STAMP, f"{sensor} was measured {stamp - now:.3f} s after now; check the clocks"
+                )
             if now - stamp > oldest[f"{sensor}_s"]:
-                raise Refused(Fault.STALE, f"{sensor} is {now - stamp:.3f} s old, at most {oldest[f'{sensor}_s']:.3f} s is accepted")
+                raise Refused(
+                    Fault.STALE,
+                    f"{sensor} is {now - stamp:.3f} s old, at most {oldest[f'{sensor}_s']:.3f} s is accepted",
+                )
             if self._last is not None:
                 before = self._last.stamps[sensor]
                 # A slow camera may repeat its frame; joints must be new in each step.
@@ -113,17 +134,24 @@ class SafetyFilter:
             scaled = np.any((np.abs(q) > 2 * np.pi + 0.1)[3:])
             if scaled:
                 raise Refused(Fault.UNITS, f"{self._names[i]} reads {q[i]:.3f}: more than a turn; are these degrees?")
-            raise Refused(Fault.OUT_OF_LIMITS, f"{self._names[i]} reads {q[i]:.4f}, outside {c.q_min[i]:.4f} to {c.q_max[i]:.4f}")
+            raise Refused(
+                Fault.OUT_OF_LIMITS, f"{self._names[i]} reads {q[i]:.4f}, outside {c.q_min[i]:.4f} to {c.q_max[i]:.4f}"
+            )
         fast = np.abs(qd) > tol["velocity_factor"] * c.qd_max
         if fast.any():
             i = int(np.argmax(np.abs(qd) / c.qd_max))
-            raise Refused(Fault.VELOCITY, f"{self._names[i]} moves at {qd[i]:.3f}, its limit is {c.qd_max[i]:.3f}; check the unit")
+            raise Refused(
+                Fault.VELOCITY, f"{self._names[i]} moves at {qd[i]:.3f}, its limit is {c.qd_max[i]:.3f}; check the unit"
+            )
         if self._last is not None:
             self._check_motion(reading, q, qd)
         half = c.data["workspace"]["base_box_m"]
         origin = q[:2] if self._origin is None else self._origin
-        if (np.abs(q[:2] - origin) > half).any():
-            raise Refused(Fault.WORKSPACE, f"the base is {np.abs(q[:2] - origin).max():.2f} m from its start, allowed {half:.2f} m")
+        if (np.abs(q[:2] - origin) > half + tol["limit"]).any():
+            raise Refused(
+                Fault.WORKSPACE,
+                f"the base is {np.abs(q[:2] - origin).max():.2f} m from its start, allowed {half:.2f} m",
+            )
 
     def _check_motion(self, reading: Reading, q: np.ndarray, qd: np.ndarray) -> None:
         """Positions and velocities must tell the same story: catches permuted values, wrong scales and jumps."""
@@ -139,7 +167,10 @@ class SafetyFilter:
         gap = np.abs(moved - mean * dt)[_STIFF] - tol["consistency"] * max(1.0, dt / self._dt)
         if (gap > 0).any():
             i = int(_STIFF[np.argmax(gap)])
-            raise Refused(Fault.INCONSISTENT, f"{self._names[i]} moved {moved[i]:.4f} in {dt:.3f} s, its velocity says {mean[i] * dt:.4f}")
+            raise Refused(
+                Fault.INCONSISTENT,
+                f"{self._names[i]} moved {moved[i]:.4f} in {dt:.3f} s, its velocity says {mean[i] * dt:.4f}",
+            )
 
     def _check_clouds(self, reading: Reading) -> None:
         for sensor, (limits, points, valid) in _CLOUDS.items():
@@ -173,11 +204,11 @@ class SafetyFilter:
             raise Refused(Fault.POLICY_OUTPUT, "the joint target holds values that are not finite")
         c, dt, q = self.contract, self._dt, self._q_cmd
         step = c.qdd_max * dt
-        upper = np.minimum(np.minimum(c.qd_max, self._v_cmd + step), brake_velocity(c.q_max - q, c.qdd_max, dt))
-        lower = np.maximum(np.maximum(-c.qd_max, self._v_cmd - step), -brake_velocity(q - c.q_min, c.qdd_max, dt))
+        upper = np.minimum(np.minimum(c.qd_max, self._v_cmd + step), brake_velocity(self._high - q, c.qdd_max, dt))
+        lower = np.maximum(np.maximum(-c.qd_max, self._v_cmd - step), -brake_velocity(q - self._low, c.qdd_max, dt))
         velocity = np.clip((q_target - q) / dt, lower, upper)
         # Rounding may leave the last bit outside; the clip moves the target by less than 1e-15.
-        target = np.clip(q + velocity * dt, c.q_min, c.q_max)
+        target = np.clip(q + velocity * dt, self._low, self._high)
         self._q_cmd, self._v_cmd = target, velocity
         return target, velocity
 
@@ -185,7 +216,7 @@ class SafetyFilter:
         """The robot was told to hold: start again from where it is, at rest."""
         self._v_cmd = np.zeros(len(self._names))
         if self._last is not None:
-            self._q_cmd = np.clip(np.asarray(self._last.q, dtype=np.float64), self.contract.q_min, self.contract.q_max)
+            self._q_cmd = np.clip(np.asarray(self._last.q, dtype=np.float64), self._low, self._high)
 
 
 def brake_velocity(distance: np.ndarray, acceleration: np.ndarray, dt: float) -> np.ndarray:

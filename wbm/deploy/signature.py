@@ -24,7 +24,9 @@ def sign(message: bytes, key_path: Path) -> bytes:
 
     key = serialization.load_pem_private_key(key_path.read_bytes(), password=None)
     if not isinstance(key, Ed25519PrivateKey):
-        raise ValueError(f"deploy.sign_key {key_path} is no ed25519 key; make one with `openssl genpkey -algorithm ed25519`")
+        raise ValueError(
+            f"deploy.sign_key {key_path} is no ed25519 key; make one with `openssl genpkey -algorithm ed25519`"
+        )
     public = key.public_key().public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
     document = {
         "algorithm": "ed25519",

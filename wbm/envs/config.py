@@ -17,6 +17,7 @@ class ActionConfig:
         ee_turn: the same for rotation, rad a step.
         ee_leash: the target stays within this distance of the hand, m.
         ee_turn_leash: the same for rotation, rad.
+        feed_forward: share of the target's own velocity that the controller is told.
         hand_step: hand joint motion at an action of 1, rad a step, for each joint's own value.
         closure_step: the same for the common closure.
         finger_step: the same for a finger's closure.
@@ -33,6 +34,7 @@ class ActionConfig:
     ee_turn: float = 0.06
     ee_leash: float = 0.06
     ee_turn_leash: float = 0.35
+    feed_forward: float = 0.8
     hand_step: float = 0.06
     closure_step: float = 0.10
     finger_step: float = 0.08
@@ -126,8 +128,7 @@ class RandomizationConfig:
         start_tilt: pre-grasp rotation about the grasp frame's x and y, rad.
         start_yaw: pre-grasp rotation about the approach direction, rad.
         start_hand: offset of each hand joint at the start, rad.
-        start_distance: distance of the base from its pre-grasp place in whole-body episodes, m.
-        start_heading: base yaw error in whole-body episodes, rad.
+        start_arm: offset of each arm joint at the start of whole-body episodes, rad.
         scene: draw the scene record at random (geometry, pose, support height, clutter); else in order.
     """
 
@@ -140,8 +141,7 @@ class RandomizationConfig:
     start_tilt: Range = field(default_factory=lambda: Range(-0.15, 0.15))
     start_yaw: Range = field(default_factory=lambda: Range(-0.5, 0.5))
     start_hand: Range = field(default_factory=lambda: Range(-0.08, 0.08))
-    start_distance: Range = field(default_factory=lambda: Range(0.3, 0.6))
-    start_heading: Range = field(default_factory=lambda: Range(-0.3, 0.3))
+    start_arm: Range = field(default_factory=lambda: Range(-0.1, 0.1))
     scene: bool = True
 
 
@@ -154,12 +154,19 @@ class EnvConfig:
         pregrasp_share: share of whole-body episodes that start at the pre-grasp all the same.
         episode_s: length of the contact-rich phase, s.
         approach_s: time allowed for the approach in whole-body episodes, s.
+        approach_speed: speed of the end-effector target on its way to the pre-grasp, m/s.
+        approach_turn: the same for rotation, rad/s.
+        approach_leash: how far the target may run ahead of the hand, m.
+        approach_back: the way leads over a point this far behind the pre-grasp against the approach direction, m.
         success_height: lift above the settled height that counts, m.
         success_hold_s: how long it must be held, s.
         standoff: distance from the object's surface to the grasp frame at the pre-grasp, m.
         reach_radius: the object is out of reach beyond this horizontal distance from its settled place, m.
         drop_height: a lifted object below this height that is not held has been dropped, m.
         max_hand_force: hand force on supports or distractors that is a forbidden collision, N.
+        fall_height: the object is out of reach this far below its settled height, m.
+        finish_s: end the episode with success after holding this long in a row, s; 0 plays every episode to its end.
+        end_on_collision: end the episode at the first forbidden contact; else it is judged at the end.
         max_speed: object speed that means the physics is unstable, m/s.
         starts_per_scene: pre-grasp solutions kept for each scene.
     """
@@ -168,12 +175,19 @@ class EnvConfig:
     pregrasp_share: float = 0.0
     episode_s: float = 3.6
     approach_s: float = 6.0
+    approach_speed: float = 0.5
+    approach_turn: float = 1.5
+    approach_leash: float = 0.15
+    approach_back: float = 0.12
     success_height: float = 0.10
     success_hold_s: float = 1.0
     standoff: float = 0.06
     reach_radius: float = 0.35
     drop_height: float = 0.03
     max_hand_force: float = 60.0
+    fall_height: float = 0.10
+    finish_s: float = 0.0
+    end_on_collision: bool = True
     max_speed: float = 15.0
     starts_per_scene: int = 8
     action: ActionConfig = field(default_factory=ActionConfig)
@@ -187,5 +201,7 @@ class EnvConfig:
             raise ValueError(f"env.pregrasp_share must be within 0 and 1, not {self.pregrasp_share}")
         if self.episode_s <= self.success_hold_s:
             raise ValueError(f"env.episode_s ({self.episode_s}) must exceed env.success_hold_s ({self.success_hold_s})")
+        if 0 < self.finish_s < self.success_hold_s:
+            raise ValueError(f"env.finish_s ({self.finish_s}) must be 0 or at least env.success_hold_s")
         if self.starts_per_scene < 1:
             raise ValueError(f"env.starts_per_scene must be at least 1, not {self.starts_per_scene}")

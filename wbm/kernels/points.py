@@ -16,6 +16,7 @@ def fill_hits(
     key: wp.array[int],  # [N]
     level: wp.array[float],  # [N]
     noise: RayNoise,
+    chunk: int,  # rays of a thread
     ray: wp.array2d[wp.vec3],  # [Q,R] unit, head frame
     sensor_pos: wp.array[wp.vec3],  # [N] as believed
     head: wp.array[wp.mat33],  # [N] head -> sensor frame
@@ -38,36 +39,40 @@ def fill_hits(
     point_w_out: wp.array2d[wp.vec3],  # [N,R] world frame
 ):
     """The measured return and all that follows from it; zeros and flags where there is none."""
-    i, r = wp.tid()
+    i, c = wp.tid()
     env = env_ids[i]
     row = pattern[env]
-    inst = slot[env, r]
-    t = hit[env, r]
-    if t >= 0.0 and noise.active != 0:
-        t = noisy_range(noise, ray, hit, row, env, r, key[env], step[env], level[env], max_range)
-    p = t * ray[row, r]
-    measured = t
-    if planar:
-        measured = p[2]
-    if t >= 0.0 and measured >= min_range and measured <= max_range:
-        p = head[env] * p
-        range_out[env, r] = t
-        depth_out[env, r] = p[2]
-        instance_out[env, r] = inst
-        id_out[env, r] = inst_id[env, inst]
-        color_out[env, r] = inst_color[env, inst]
-        valid_out[env, r] = True
-        point_s_out[env, r] = p
-        point_w_out[env, r] = sensor_pos[env] + sensor_rot[env] * p
-    else:
-        range_out[env, r] = -1.0
-        depth_out[env, r] = -1.0
-        instance_out[env, r] = -1
-        id_out[env, r] = -1
-        color_out[env, r] = wp.vec3(0.0, 0.0, 0.0)
-        valid_out[env, r] = False
-        point_s_out[env, r] = wp.vec3(0.0, 0.0, 0.0)
-        point_w_out[env, r] = wp.vec3(0.0, 0.0, 0.0)
+    rot = sensor_rot[env]
+    pos = sensor_pos[env]
+    turn = head[env]
+    for r in range(c * chunk, wp.min((c + 1) * chunk, ray.shape[1])):
+        inst = slot[env, r]
+        t = float(hit[env, r])
+        if t >= 0.0 and noise.active != 0:
+            t = noisy_range(noise, ray, hit, row, env, r, key[env], step[env], level[env], max_range)
+        p = t * ray[row, r]
+        measured = t
+        if planar:
+            measured = p[2]
+        if t >= 0.0 and measured >= min_range and measured <= max_range:
+            p_s = turn * p
+            range_out[env, r] = t
+            depth_out[env, r] = p_s[2]
+            instance_out[env, r] = inst
+            id_out[env, r] = inst_id[env, inst]
+            color_out[env, r] = inst_color[env, inst]
+            valid_out[env, r] = True
+            point_s_out[env, r] = p_s
+            point_w_out[env, r] = pos + rot * p_s
+        else:
+            range_out[env, r] = -1.0
+            depth_out[env, r] = -1.0
+            instance_out[env, r] = -1
+            id_out[env, r] = -1
+            color_out[env, r] = wp.vec3(0.0, 0.0, 0.0)
+            valid_out[env, r] = False
+            point_s_out[env, r] = wp.vec3(0.0, 0.0, 0.0)
+            point_w_out[env, r] = wp.vec3(0.0, 0.0, 0.0)
 
 
 @wp.func

@@ -6,7 +6,7 @@ touches the bundle's cone (`cull_bundles`), nearest first, so that a ray stops a
 its hit (`trace_rays`). Geometry types and sizes use MuJoCo's numbers. Distances are along unit rays, in metres.
 """
 
-# ruff: noqa: RUF046, UP018 (int(0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, SIM109, UP018 (int(0) declares a dynamic variable in a Warp kernel; `in` is not compiled)
 import warp as wp
 
 from wbm.kernels.se3 import quat_wxyz_normalize, quat_wxyz_to_mat
@@ -224,8 +224,9 @@ def place_instances(
     mesh_out: wp.array2d[wp.uint64],
     rot_out: wp.array2d[wp.mat33],  # sensor frame -> instance frame
     origin_out: wp.array2d[wp.vec3],  # sensor origin in the instance frame
-    sphere_out: wp.array2d[wp.vec4],  # bounding sphere in the sensor frame
-    near_out: wp.array2d[float],  # nearest range of the bounding sphere
+    sphere_out: wp.array2d[wp.vec4],  # centre c of the bounding sphere in the sensor frame, |c|^2 - r^2
+    cone_out: wp.array2d[wp.vec4],  # direction of its centre, cosine of its angular radius
+    near_out: wp.array2d[float],  # its nearest range, 0 if it holds the sensor
 ):
     """List the instances that the sensor may see, in its own frame; `ok` is 0 where no ray can be trusted."""
     env = env_ids[wp.tid()]
@@ -273,8 +274,13 @@ def place_instances(
                     mesh_out[env, count] = mesh
                     rot_out[env, count] = wp.transpose(R_WI) * R_WS
                     origin_out[env, count] = origin
-                    sphere_out[env, count] = wp.vec4(c[0], c[1], c[2], radius * 1.0001)
-                    near_out[env, count] = wp.max(distance - radius * 1.0001, 0.0)
+                    # Widened, so that rounding never loses a hit.
+                    bound = wp.min(radius * 1.0001 + 1.0e-6 * distance, UNBOUNDED)
+                    sphere_out[env, count] = wp.vec4(c[0], c[1], c[2], distance * distance * 0.999999 - bound * bound)
+                    near_out[env, count] = wp.max(distance - bound, 0.0)
+                    u = c / wp.max(distance, 1.0e-9)
+                    sine = wp.min(bound / wp.max(distance, 1.0e-9), 1.0)
+                    cone_out[env, count] = wp.vec4(u[0], u[1], u[2], wp.sqrt(1.0 - sine * sine))
                     count += 1
     if ok:
         ok_out[env] = 1
@@ -284,44 +290,86 @@ def place_instances(
         count_out[env] = 0
 
 
+@wp.func
+def is_leaving(kind: int, o: wp.vec3, size: wp.vec3, axis: wp.vec3, cos_half: float, sin_half: float) -> bool:
+    """Whether a face's outer half space holds the origin and every ray of a cone leads further out; instance frame.
+
+    The least component of a cone's directions along a face normal n is `cos(angle(axis, n) + half)`.
+    """
+    if kind == CAPSULE or kind == SPHERE or kind == MESH:
+        return False
+    for i in range(3):
+        extent = size[i]
+        if kind == PLANE:
+            extent = 0.0
+        if kind == CYLINDER:
+            extent = size[1]
+        side = wp.sign(o[i])
+        if (kind == BOX or i == 2) and wp.abs(o[i]) > extent:
+            a = side * axis[i]
+            if a * cos_half - wp.sqrt(wp.max(1.0 - a * a, 0.0)) * sin_half > 1.0e-4:
+                return True
+    return False
+
+
+@wp.func
+def cones_meet(cone: wp.vec4, cos_other: float, axis_other: wp.vec3) -> bool:
+    """Whether two cones with one apex overlap: the angle between their axes is at most the sum of their half angles."""
+    sines = wp.sqrt(wp.max(1.0 - cone[3] * cone[3], 0.0) * wp.max(1.0 - cos_other * cos_other, 0.0))
+    between = cone[0] * axis_other[0] + cone[1] * axis_other[1] + cone[2] * axis_other[2]
+    return cos_other < 0.0 or between >= cone[3] * cos_other - sines - 1.0e-5
+
+
 @wp.kernel(enable_backward=False)
 def cull_bundles(
     # in:
     env_ids: wp.array[int],  # [n]
     pattern: wp.array[int],  # [N] row of the ray table
     cone: wp.array2d[wp.vec4],  # [Q,G] axis, cosine of the half angle
+    group_cone: wp.array2d[wp.vec4],  # [Q,G'] the same around `group` bundles
+    group: int,
     count: wp.array[int],  # [N]
-    sphere: wp.array2d[wp.vec4],  # [N,I]
+    slot_cone: wp.array2d[wp.vec4],  # [N,I]
     near: wp.array2d[float],  # [N,I]
+    kind: wp.array2d[int],
+    size: wp.array2d[wp.vec3],
+    rot: wp.array2d[wp.mat33],
+    origin: wp.array2d[wp.vec3],
+    # scratch:
+    group_scratch: wp.array3d[wp.int16],  # [N,G',I]
     # out:
     cand_count_out: wp.array2d[int],  # [N,G]
     cand_out: wp.array3d[wp.int16],  # [N,G,I] slots, nearest first
 ):
-    """Slots whose bounding sphere touches each bundle's cone, sorted by their nearest range."""
-    i, g = wp.tid()
+    """Slots whose bounding sphere meets each bundle's cone and that lie ahead, sorted by their nearest range."""
+    i, h = wp.tid()
     env = env_ids[i]
-    c4 = cone[pattern[env], g]
-    axis = wp.vec3(c4[0], c4[1], c4[2])
-    cos_half = c4[3]
-    sin_half = wp.sqrt(wp.max(1.0 - cos_half * cos_half, 0.0))
-    num = int(0)
+    row = pattern[env]
+    whole = group_cone[row, h]
+    axis = wp.vec3(whole[0], whole[1], whole[2])
+    found = int(0)
     for s in range(count[env]):
-        s4 = sphere[env, s]
-        c = wp.vec3(s4[0], s4[1], s4[2])
-        r = s4[3]
-        along = wp.dot(c, axis)
-        # The line's distance is a lower bound of the cone's; behind the apex a half space is the better one.
-        if cos_half < 0.0 or along > -r:
-            aside = wp.sqrt(wp.max(wp.length_sq(c) - along * along, 0.0))
-            if aside * cos_half - along * sin_half <= r:
-                key = near[env, s]
-                j = int(num)
-                while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
-                    cand_out[env, g, j] = cand_out[env, g, j - 1]
-                    j -= 1
-                cand_out[env, g, j] = wp.int16(s)
-                num += 1
-    cand_count_out[env, g] = num
+        if near[env, s] <= 0.0 or cones_meet(slot_cone[env, s], whole[3], axis):
+            group_scratch[env, h, found] = wp.int16(s)
+            found += 1
+    for g in range(h * group, wp.min((h + 1) * group, cone.shape[1])):
+        c4 = cone[row, g]
+        axis = wp.vec3(c4[0], c4[1], c4[2])
+        sin_half = wp.sqrt(wp.max(1.0 - c4[3] * c4[3], 0.0))
+        num = int(0)
+        for m in range(found):
+            s = int(group_scratch[env, h, m])
+            key = near[env, s]
+            if key <= 0.0 or cones_meet(slot_cone[env, s], c4[3], axis):
+                ahead = rot[env, s] * axis
+                if c4[3] < 0.0 or not is_leaving(kind[env, s], origin[env, s], size[env, s], ahead, c4[3], sin_half):
+                    j = int(num)
+                    while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
+                        cand_out[env, g, j] = cand_out[env, g, j - 1]
+                        j -= 1
+                    cand_out[env, g, j] = wp.int16(s)
+                    num += 1
+        cand_count_out[env, g] = num
 
 
 @wp.kernel(enable_backward=False)
@@ -332,6 +380,7 @@ def trace_rays(
     direction: wp.array2d[wp.vec3],  # [Q,R] unit, bundle order, sensor frame
     order: wp.array2d[int],  # [Q,R] bundle order -> ray
     bundle: int,
+    chunk: int,  # rays of a thread
     max_range: float,
     slot_inst: wp.array2d[int],  # [N,I]
     kind: wp.array2d[int],
@@ -343,35 +392,56 @@ def trace_rays(
     near: wp.array2d[float],
     cand_count: wp.array2d[int],  # [N,G]
     cand: wp.array3d[wp.int16],  # [N,G,I]
+    # scratch:
+    best_scratch: wp.array2d[float],  # [N,R] bundle order
+    inst_scratch: wp.array2d[int],  # [N,R]
     # out:
     range_out: wp.array2d[float],  # [N,R] -1 where nothing is hit
     instance_out: wp.array2d[int],  # [N,R] -1 where nothing is hit
 ):
     """Nearest hit of every ray along its bundle's list."""
-    i, k = wp.tid()
+    i, c = wp.tid()
     env = env_ids[i]
     row = pattern[env]
-    d = direction[row, k]
-    g = k // bundle
-    best = float(max_range)
-    hit = int(-1)
+    first = c * chunk
+    end = wp.min(first + chunk, direction.shape[1])
+    g = first // bundle
+    for k in range(first, end):
+        best_scratch[env, k] = max_range
+        inst_scratch[env, k] = -1
+    # An instance's data is loaded once for all rays of the thread; it may stop when all hits lie before the next one.
+    farthest = float(max_range)
     for j in range(cand_count[env, g]):
         s = int(cand[env, g, j])
-        if near[env, s] > best:
+        start = near[env, s]
+        if start > farthest:
             break
         s4 = sphere[env, s]
-        c = wp.vec3(s4[0], s4[1], s4[2])
-        t_mid = wp.dot(c, d)
-        aside = c - t_mid * d
-        if wp.dot(aside, aside) <= s4[3] * s4[3]:
-            t = ray_instance(kind[env, s], origin[env, s], rot[env, s] * d, size[env, s], mesh[env, s], best)
-            if t < best:
-                best = t
-                hit = s
-    out = order[row, k]
-    if hit >= 0:
-        range_out[env, out] = best
-        instance_out[env, out] = slot_inst[env, hit]
-    else:
-        range_out[env, out] = -1.0
-        instance_out[env, out] = -1
+        centre = wp.vec3(s4[0], s4[1], s4[2])
+        inst = slot_inst[env, s]
+        shape = kind[env, s]
+        R_IS = rot[env, s]
+        o = origin[env, s]
+        extent = size[env, s]
+        mesh_id = mesh[env, s]
+        farthest = float(0.0)
+        for k in range(first, end):
+            best = best_scratch[env, k]
+            if start <= best:
+                d = direction[row, k]
+                along = wp.dot(centre, d)
+                if s4[3] <= 0.0 or (along > 0.0 and along * along >= s4[3]):
+                    t = ray_instance(shape, o, R_IS * d, extent, mesh_id, best)
+                    if t < best:
+                        best = t
+                        best_scratch[env, k] = t
+                        inst_scratch[env, k] = inst
+            farthest = wp.max(farthest, best)
+    for k in range(first, end):
+        out = order[row, k]
+        inst = inst_scratch[env, k]
+        instance_out[env, out] = inst
+        if inst >= 0:
+            range_out[env, out] = best_scratch[env, k]
+        else:
+            range_out[env, out] = -1.0

@@ -1,1 +1,1 @@
-
+"""Statistics, plots, videos, the report page and the viewer."""

@@ -2,44 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import warp as wp
 
 from wbm.kernels.points import assemble_cloud
-from wbm.sensors.delay import DelayConfig, FrameDelay
+from wbm.sensors.config import CloudConfig
+from wbm.sensors.delay import FrameDelay
 from wbm.sensors.ray_sensor import EnvIds, RaySensor
 from wbm.sensors.scene import Semantic
 
 FIELDS = ("xyz", "rgb", "valid", "target", "robot", "id")
-
-
-@dataclass(frozen=True)
-class CloudConfig:
-    """How a scan becomes a cloud.
-
-    Attributes:
-        num_points: P.
-        target_share: share of the P points that may lie on the target while others can fill the rest.
-        crop_min, crop_max: corners of the box of points that are kept, base frame, m.
-        self_filter: whether points on the robot are left out.
-        delay: latency of the cloud.
-    """
-
-    num_points: int = 256
-    target_share: float = 0.4
-    crop_min: tuple[float, float, float] = (-3.0, -3.0, -0.1)
-    crop_max: tuple[float, float, float] = (3.0, 3.0, 2.5)
-    self_filter: bool = False
-    delay: DelayConfig = field(default_factory=DelayConfig)
-
-    def __post_init__(self) -> None:
-        if self.num_points < 1:
-            raise ValueError(f"cloud: num_points must be >= 1, got {self.num_points}")
-        if not 0 <= self.target_share <= 1:
-            raise ValueError("cloud: target_share must lie in [0, 1]")
-        if any(lo >= hi for lo, hi in zip(self.crop_min, self.crop_max, strict=True)):
-            raise ValueError("cloud: crop_min must lie below crop_max")
 
 
 class PointCloud:
@@ -49,7 +20,7 @@ class PointCloud:
     was measured; points stay in that frame however late they are delivered.
 
     Outputs [N,P]: `xyz` [vec3], base frame, m; `rgb` [vec3] in 0..1; `valid`, `target`, `robot` [bool]; `id` [int32].
-    Where a scan has too few points the last places are zeros with `valid` False. `age` [N] int32 is the latency in steps.
+    Where a scan has too few points the last places are zeros with `valid` False. `age` [N] int32: the latency, steps.
     """
 
     def __init__(self, config: CloudConfig, sensor: RaySensor, target_id: int = Semantic.TARGET, seed: int = 0) -> None:
@@ -91,9 +62,9 @@ class PointCloud:
             assemble_cloud,
             dim=ids.shape[0],
             inputs=[
-                ids, s.step, s.key, self.seed, self.base_pos, self.base_quat, wp.vec3(*c.crop_min), wp.vec3(*c.crop_max),
-                self.target_id, int(Semantic.ROBOT), c.self_filter, int(c.target_share * c.num_points), s.valid, s.id,
-                s.color, s.point_w, self._class,
+                ids, s.step, s.key, self.seed, self.base_pos, self.base_quat, wp.vec3(*c.crop_min),
+                wp.vec3(*c.crop_max), self.target_id, int(Semantic.ROBOT), c.self_filter,
+                int(c.target_share * c.num_points), s.valid, s.id, s.color, s.point_w, self._class,
             ],
             outputs=[self._newest[name] for name in FIELDS],
             device=s.scene.device,

@@ -3,38 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import warp as wp
 
 from wbm.kernels.noise_delay import pass_frame, plan_delivery, restart_delivery
-
-
-@dataclass(frozen=True)
-class DelayConfig:
-    """When frames are delivered, in policy steps.
-
-    Attributes:
-        delay_min, delay_max: an episode's delay is drawn uniformly from these whole numbers.
-        lost: chance that a frame is not delivered; the one before it stays.
-        hold_max: a frame is held for at most this many steps beyond the delay.
-    """
-
-    delay_min: int = 0
-    delay_max: int = 0
-    lost: float = 0.0
-    hold_max: int = 3
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.delay_min <= self.delay_max or self.hold_max < 0:
-            raise ValueError("delay: need 0 <= delay_min <= delay_max and hold_max >= 0")
-        if not 0 <= self.lost <= 1:
-            raise ValueError("delay: lost is a chance in [0, 1]")
-
-    @property
-    def active(self) -> bool:
-        """Whether any frame can be late."""
-        return self.delay_max > 0 or self.lost > 0
+from wbm.sensors.config import DelayConfig
 
 
 class FrameDelay:
@@ -63,7 +36,7 @@ class FrameDelay:
         self.out = {name: wp.zeros_like(array) for name, array in self._frame.items()}
         self._views = []
         for name, array in self._frame.items():
-            width = array.capacity // n if n else 0
+            width = array.strides[0] if n else 0
             ring = wp.zeros((n, self._ring_size, width), dtype=wp.uint8, device=device)
             self._views.append((_bytes(array, n, width), ring, _bytes(self.out[name], n, width)))
 
@@ -87,7 +60,8 @@ class FrameDelay:
             plan_delivery,
             dim=env_ids.shape[0],
             inputs=[
-                env_ids, self.key, self.seed, c.delay_min, c.delay_max, c.lost, self._ring_size, self._count, self._last,
+                env_ids, self.key, self.seed, c.delay_min, c.delay_max, c.lost, self._ring_size, self._count,
+                self._last,
             ],
             outputs=[self._write, self._read, self.age],
             device=device,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -11,27 +10,11 @@ import warp as wp
 from wbm.kernels.noise import RayNoise, aim_sensors
 from wbm.kernels.points import fill_hits
 from wbm.kernels.rays import cull_bundles, place_instances, trace_rays
-from wbm.sensors.bundles import BUNDLE, RayTable, build_table
+from wbm.sensors.bundles import BUNDLE, GROUP, RayTable, build_table
+from wbm.sensors.config import ExtrinsicNoise
 from wbm.sensors.scene import RayScene
 
 EnvIds = Sequence[int] | np.ndarray | wp.array | None
-
-
-@dataclass(frozen=True)
-class ExtrinsicNoise:
-    """Mounting error, drawn once an episode: the rays leave the pose `X_WS exp(xi)`, the points are placed with `X_WS`.
-
-    Attributes:
-        sigma_pos: deviation of each coordinate, m.
-        sigma_rot: deviation of each component of the rotation vector, rad.
-    """
-
-    sigma_pos: float = 0.0
-    sigma_rot: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.sigma_pos < 0 or self.sigma_rot < 0:
-            raise ValueError("extrinsic noise: sigma_pos and sigma_rot must be >= 0")
 
 
 class RaySensor:
@@ -47,7 +30,7 @@ class RaySensor:
         range: distance along the ray, m. depth: coordinate along sensor z, m.
         instance: index of the instance in the scene. id: its semantic id. color [vec3]: RGB in 0..1. valid [bool].
         point_s, point_w [vec3]: in the sensor frame and in the world (through the believed pose), m.
-        true_range: noiseless distance, -1 for none.
+        true_range, true_instance: what the ray meets within reach, before limits and noise, -1 for none.
         ok [N]: 0 where nothing can be trusted (a pose that is not finite, a sensor inside an object): all is invalid.
     """
 
@@ -85,19 +68,22 @@ class RaySensor:
         self.noise, self.extrinsic = noise or RayNoise(), extrinsic or ExtrinsicNoise()
         self.noise.seed = self.seed
         # A corner ray is longer than its planar depth.
-        self._reach = self.max_range / float(rays[..., 2].min()) if planar else self.max_range
+        self.reach = self.max_range / float(rays[..., 2].min()) if planar else self.max_range
         self.table: RayTable = build_table(rays, bundle)
         self.num_envs, self.num_rays = scene.num_envs, rays.shape[1]
+        # A CPU thread takes a whole bundle, which spares the cost of starting a thread a ray.
+        self._chunk = bundle if scene.device.is_cpu else 1
         self._upload_table()
         self._allocate()
 
     def _upload_table(self) -> None:
         table, device = self.table, self.scene.device
         in_order = np.take_along_axis(table.rays, table.order[:, :, None].astype(np.int64), axis=1)
-        self._rays = wp.array(table.rays.astype(np.float32), dtype=wp.vec3, device=device)
+        self.rays = wp.array(table.rays.astype(np.float32), dtype=wp.vec3, device=device)
         self._sorted = wp.array(in_order.astype(np.float32), dtype=wp.vec3, device=device)
         self._order = wp.array(table.order, dtype=wp.int32, device=device)
         self._cone = wp.array(table.cone.astype(np.float32), dtype=wp.vec4, device=device)
+        self._group_cone = wp.array(table.group_cone.astype(np.float32), dtype=wp.vec4, device=device)
 
     def _allocate(self) -> None:
         n, device = self.num_envs, self.scene.device
@@ -119,9 +105,11 @@ class RaySensor:
         self._inst, self._kind = new(slots, wp.int32), new(slots, wp.int32)
         self._size, self._mesh = new(slots, wp.vec3), new(slots, wp.uint64)
         self._rot, self._origin = new(slots, wp.mat33), new(slots, wp.vec3)
-        self._sphere, self._near = new(slots, wp.vec4), new(slots, wp.float32)
+        self._sphere, self._slot_cone, self._near = new(slots, wp.vec4), new(slots, wp.vec4), new(slots, wp.float32)
         self._cand_count, self._cand = new(bundles, wp.int32), new((*bundles, slots[1]), wp.int16)
-        self.true_range, self._hit_inst = new(hits, wp.float32), new(hits, wp.int32)
+        self._group = new((n, self._group_cone.shape[1], slots[1]), wp.int16)
+        self._best, self._best_inst = new(hits, wp.float32), new(hits, wp.int32)
+        self.true_range, self.true_instance = new(hits, wp.float32), new(hits, wp.int32)
         self.range, self.depth = new(hits, wp.float32), new(hits, wp.float32)
         self.instance, self.id = new(hits, wp.int32), new(hits, wp.int32)
         self.color, self.valid = new(hits, wp.vec3), new(hits, wp.bool)
@@ -172,42 +160,52 @@ class RaySensor:
             dim=num,
             inputs=[
                 ids, self.true_pos, self.true_quat, self.exclude_body, wp.vec3(*axis), float(np.cos(half)),
-                max(float(np.sin(half)), 0.0), self._reach, s.body_pos, s.body_quat, s.type, s.size, s.mesh, s.body,
+                max(float(np.sin(half)), 0.0), self.reach, s.body_pos, s.body_quat, s.type, s.size, s.mesh, s.body,
                 s.pos, s.quat, s.mesh_ids, s.mesh_sphere,
             ],
             outputs=[
                 self.ok, self._count, self._inst, self._kind, self._size, self._mesh, self._rot, self._origin,
-                self._sphere, self._near,
+                self._sphere, self._slot_cone, self._near,
             ],
             device=device,
         )  # fmt: skip
         wp.launch(
             cull_bundles,
-            dim=(num, self._cand_count.shape[1]),
-            inputs=[ids, self.pattern, self._cone, self._count, self._sphere, self._near],
+            dim=(num, self._group_cone.shape[1]),
+            inputs=[
+                ids, self.pattern, self._cone, self._group_cone, GROUP, self._count, self._slot_cone, self._near,
+                self._kind, self._size, self._rot, self._origin, self._group,
+            ],
             outputs=[self._cand_count, self._cand],
             device=device,
-        )
+        )  # fmt: skip
         wp.launch(
             trace_rays,
-            dim=(num, self.num_rays),
+            dim=(num, -(-self.num_rays // self._chunk)),
             inputs=[
-                ids, self.pattern, self._sorted, self._order, self.bundle, self._reach, self._inst, self._kind,
-                self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count, self._cand,
+                ids, self.pattern, self._sorted, self._order, self.bundle, self._chunk, self.reach, self._inst,
+                self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count,
+                self._cand, self._best, self._best_inst,
             ],
-            outputs=[self.true_range, self._hit_inst],
+            outputs=[self.true_range, self.true_instance],
             device=device,
         )  # fmt: skip
+
+    @property
+    def placed(self) -> tuple[wp.array, ...]:
+        """Instances as the last `trace` listed them: count [N]; kind, size, mesh, rotation and origin in the instance's
+        frame, bounding sphere in the sensor's and its nearest range [N,I]."""
+        return self._count, self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near
 
     def fill(self, ids: wp.array) -> None:
         """Apply the noise and derive depth, ids, colour, flags and points of the given environments."""
         wp.launch(
             fill_hits,
-            dim=(ids.shape[0], self.num_rays),
+            dim=(ids.shape[0], -(-self.num_rays // self._chunk)),
             inputs=[
-                ids, self.pattern, self.step, self.key, self.level, self.noise, self._rays, self.pos, self._head,
-                self._rotation, self.planar, self.min_range, self.max_range, self.true_range, self._hit_inst,
-                self.scene.id, self.scene.color,
+                ids, self.pattern, self.step, self.key, self.level, self.noise, self._chunk, self.rays, self.pos,
+                self._head, self._rotation, self.planar, self.min_range, self.max_range, self.true_range,
+                self.true_instance, self.scene.id, self.scene.color,
             ],
             outputs=[
                 self.range, self.depth, self.instance, self.id, self.color, self.valid, self.point_s, self.point_w,

@@ -212,6 +212,26 @@ class RayScene:
                 values = np.broadcast_to(values, (len(env_ids), *values.shape[1:]))
             self._write(getattr(self, f.name), env_ids, values)
 
+    def like(self, num_envs: int) -> RayScene:
+        """A scene of unused instances with the same numbers of bodies and instances, sharing this one's meshes."""
+        other = RayScene(num_envs, self.num_bodies, self.num_instances, device=str(self.device))
+        other._meshes, other._spheres = list(self._meshes), list(self._spheres)
+        other.mesh_ids, other.mesh_sphere = self.mesh_ids, self.mesh_sphere
+        return other
+
+    def copy_envs(self, source: RayScene, env_ids: Sequence[int] | np.ndarray) -> None:
+        """Make environment k of this scene what environment `env_ids[k]` of `source` is now, bodies included.
+
+        Raises:
+            ValueError: an environment out of range.
+        """
+        env_ids = np.asarray(env_ids, np.int64)
+        if len(env_ids) != self.num_envs or env_ids.min(initial=0) < 0 or env_ids.max(initial=-1) >= source.num_envs:
+            raise ValueError(f"copy_envs: need {self.num_envs} environments within 0..{source.num_envs - 1}")
+        everyone = np.arange(self.num_envs)
+        for name in ("body_pos", "body_quat", *(f.name for f in fields(Instances))):
+            self._write(getattr(self, name), everyone, getattr(source, name).numpy()[env_ids])
+
     def _check(self, row: Instances) -> None:
         used = row.type != UNUSED
         if not np.isin(row.type, KINDS).all():

@@ -50,6 +50,18 @@ class MjBatchSimulation(Simulation):
     def set_const(self, ids: torch.Tensor) -> None:
         self._batch.set_const(env_ids(ids))
 
+    def save_state(self) -> dict[str, torch.Tensor]:
+        return {"state": torch.from_numpy(self._batch.bind("state")).clone(), "sensordata": self.sensordata.clone()}
+
+    def load_state(self, state: dict[str, torch.Tensor]) -> None:
+        rows = torch.from_numpy(self._batch.bind("state"))
+        rows.copy_(state["state"])
+        # The float32 tensors follow the rows only through a call, and a stale one would be read as a write. The call
+        # moves the solver's warm start, so the rows are written once more.
+        self._batch.forward()
+        rows.copy_(state["state"])
+        self.sensordata.copy_(state["sensordata"])
+
     @staticmethod
     def _require(owner, name: str):
         value = getattr(owner, name, None)

@@ -88,6 +88,14 @@ class Simulation(ABC):
     def set_const(self, ids: torch.Tensor) -> None:
         """Recompute model constants of environments `ids` after masses, inertias or gains changed."""
 
+    @abstractmethod
+    def save_state(self) -> dict[str, torch.Tensor]:
+        """Everything that the next step depends on, model fields apart, as copies."""
+
+    @abstractmethod
+    def load_state(self, state: dict[str, torch.Tensor]) -> None:
+        """Restore `save_state`'s answer exactly; the environments' model fields must be as they were."""
+
     def sensor_slice(self, name: str) -> slice:
         """Columns of `sensordata` that belong to a sensor.
 

@@ -1,0 +1,60 @@
+"""distill: train the student on rollouts."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+KIND = "student"
+SECTIONS = ("seed", "student", "distill")
+INPUTS = ("rollouts",)
+
+
+def name(cfg: Any) -> str:
+    """Name of the artifact."""
+    return "main"
+
+
+def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
+    """Train on the rollouts' shards; publish weights, specification and learning curve."""
+    from dataclasses import replace
+
+    from wbm.artifacts.episode_reader import EpisodeReader, shard_paths
+    from wbm.learning.distill import distill
+    from wbm.learning.student import count_parameters, save_student
+    from wbm.robot.schema import PolicySchema
+
+    # Open the input: the schema is the one that the episodes were written with
+    paths = shard_paths(inputs["rollouts"].path / "shards")
+    schema = PolicySchema.from_dict(EpisodeReader(paths[0]).schema)
+    settings = replace(cfg.distill, seed=cfg.distill.seed + cfg.seed)
+
+    # Train
+    started = time.process_time()
+    with progress.task("distill", total=settings.total_iterations) as task:
+        done = 0
+
+        def report(step: int, total: int, figures: dict[str, float]) -> None:
+            nonlocal done
+            task.update(step - done, **figures)
+            done = step
+
+        result = distill(paths, schema, cfg.student, settings, draft.scratch, report)
+
+    # Publish
+    save_student(draft.path, result.network, {"iterations": settings.total_iterations})
+    (draft.path / "curve.json").write_text(json.dumps(result.curve, indent=1) + "\n", encoding="utf-8")
+    last = result.curve[-1]
+    for view in ("both", "mask", "text"):
+        if f"val_{view}_loss" in last:
+            draft.metrics[f"val_{view}_loss"] = last[f"val_{view}_loss"]
+    draft.metrics |= {
+        "train_loss": last["train_loss"],
+        "p_obj_error_m": last.get("val_both_p_obj_m", last["train_p_obj_m"]),
+        "parameters": count_parameters(result.network),
+        "episodes": result.num_episodes,
+        "windows": result.num_windows,
+        "cpu_seconds": round(time.process_time() - started, 1),
+    }
+    draft.seeds["distill"] = settings.seed

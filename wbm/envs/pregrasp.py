@@ -1,0 +1,183 @@
+"""Pre-grasp start states: for each scene, joint positions that put the grasp frame in front of the target."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from wbm.control.config import WbcConfig
+from wbm.control.wbc import WholeBodyController
+from wbm.envs.actions import HAND_OPEN
+from wbm.envs.binding import SceneTable
+from wbm.envs.config import EnvConfig
+from wbm.envs.draws import Columns, episode_uniforms
+from wbm.envs.randomization import scaled
+from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, quat_to_mat, rotate
+from wbm.robot import joints
+from wbm.robot.model import RobotModel
+
+
+@dataclass
+class StartBank:
+    """Joint positions at pre-grasps: `q` [S,K,32]; scene s has `count[s]` of them, first in its row.
+
+    A scene without a reachable pre-grasp has a count of 0; `draw` must not be asked for it.
+    """
+
+    q: Tensor
+    count: Tensor
+
+    def draw(self, scenes: Tensor, uniform: Tensor) -> Tensor:
+        """One start [K,32] for each of `scenes` [K], picked by `uniform` [K] in [0, 1)."""
+        pick = (uniform * self.count[scenes]).long()
+        return self.q[scenes, pick].clone()
+
+    @property
+    def usable(self) -> Tensor:
+        """Indices of the scenes that have a start."""
+        return self.count.nonzero().squeeze(1)
+
+
+def grasp_poses(table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Pre-grasp positions [B,3] and orientations [B,4] of the grasp frame, jittered by `u` [B,7].
+
+    `top_down`: z down above the target, x (the direction in which fingers and thumb close) along the shorter horizontal
+    axis of its bounding box. `side`: z horizontal, x horizontal, so that the fingers wrap around an upright object.
+    """
+    r = cfg.randomization
+    mat = quat_to_mat(table.target_quat[scenes])
+    centre = table.target_pos[scenes]
+    extent = mat.abs() @ table.box_half[scenes].unsqueeze(-1)  # half extents along the world's axes
+    top = centre[:, 2] + extent[:, 2, 0]
+    if grasp == "top_down":
+        shape = (mat * table.box_half[scenes].unsqueeze(1))[:, :2]  # box axes scaled, seen from above [B,2,3]
+        spread = shape @ shape.transpose(1, 2)
+        yaw = 0.5 * torch.atan2(2 * spread[:, 0, 1], spread[:, 0, 0] - spread[:, 1, 1]) + math.pi / 2
+        # Of the two opposite directions the one that points away from the base is in the wrist's reach.
+        yaw = torch.where(torch.cos(yaw - table.base[scenes, 2]) < 0, yaw + math.pi, yaw)
+        zero = torch.zeros_like(yaw)
+        down = torch.tensor([0.0, 1.0, 0.0, 0.0], device=yaw.device).expand(len(yaw), 4)
+        quat = quat_mul(quat_exp(torch.stack([zero, zero, yaw], -1)), down)
+        pos = torch.stack([centre[:, 0], centre[:, 1], top + cfg.standoff], -1)
+    else:
+        yaw = table.base[scenes, 2] + 1.2 * (u[:, 0] - 0.5)  # from where the robot stands
+        zero = torch.zeros_like(yaw)
+        # Columns x, y, z of the unturned frame: x to the left, y down, z ahead.
+        ahead = torch.tensor([0.5, 0.5, 0.5, 0.5], device=yaw.device).expand(len(yaw), 4)
+        quat = quat_mul(quat_exp(torch.stack([zero, zero, yaw], -1)), ahead)
+        radius = extent[:, :2, 0].amax(1) + cfg.standoff
+        away = torch.stack([torch.cos(yaw), torch.sin(yaw), zero], -1) * radius.unsqueeze(1)
+        pos = centre - away
+    turn = torch.stack([scaled(r.start_tilt, u[:, 1]), scaled(r.start_tilt, u[:, 2]), scaled(r.start_yaw, u[:, 3])], -1)
+    shift = torch.stack([scaled(r.start_offset, u[:, k]) for k in (4, 5, 6)], -1)
+    return pos + rotate(quat, shift), quat_mul(quat, quat_exp(turn))
+
+
+def solve_starts(
+    table: SceneTable,
+    robot: RobotModel,
+    wbc_cfg: WbcConfig,
+    cfg: EnvConfig,
+    grasp: str,
+    seed: int = 0,
+    device: str = "cpu",
+    batch: int = 512,
+    iterations: int = 120,
+    rounds: int = 4,
+) -> StartBank:
+    """Find `cfg.starts_per_scene` pre-grasps for each scene by running the controller itself, kinematically.
+
+    Candidates stand on random sides of the target; those that reach the pose clear of every obstacle are kept.
+
+    Args:
+        batch: candidates solved together.
+        iterations: controller steps given to a candidate.
+        rounds: candidates tried for each wanted start, at most.
+
+    Raises:
+        ValueError: no scene has a reachable pre-grasp.
+    """
+    count, keep = table.count, cfg.starts_per_scene
+    bank = torch.zeros(count, keep, joints.NUM_JOINTS, device=device)
+    found = torch.zeros(count, dtype=torch.int64, device=device)
+    solver = _Solver(table, robot, wbc_cfg, batch, device)
+    columns, tried = Columns(), 0
+    jitter, stand = columns.add("jitter", 7), columns.add("stand", 3)
+    for _ in range(rounds):
+        # Every scene that lacks starts gets as many candidates as it lacks, interleaved so that all scenes progress.
+        lacking = torch.cat([(found < keep - k).nonzero().squeeze(1) for k in range(keep)])
+        for first in range(0, len(lacking), batch):
+            part = lacking[first : first + batch]
+            u = torch.from_numpy(episode_uniforms(seed, np.arange(tried, tried + len(part)), columns.count)).to(device)
+            tried += len(part)
+            pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter])
+            q, good = solver.solve(part, pos, quat, stand_poses(table.base[part], u[:, stand]), iterations)
+            for scene, row in zip(part[good].tolist(), q[good], strict=True):
+                if found[scene] < keep:
+                    bank[scene, found[scene]] = row
+                    found[scene] += 1
+    if int(found.max()) == 0:
+        raise ValueError(
+            f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff"
+        )
+    return StartBank(bank, found)
+
+
+def stand_poses(base: Tensor, u: Tensor) -> Tensor:
+    """Base poses [B,3] (x, y, yaw) near the scenes' own grasp places, jittered by `u` [B,3]."""
+    spread = torch.tensor([0.10, 0.20, 0.30], device=base.device)
+    offset = spread * (u - 0.5)
+    c, s = torch.cos(base[:, 2]), torch.sin(base[:, 2])
+    x = base[:, 0] + c * offset[:, 0] - s * offset[:, 1]
+    y = base[:, 1] + s * offset[:, 0] + c * offset[:, 1]
+    return torch.stack([x, y, base[:, 2] + offset[:, 2]], -1)
+
+
+class _Solver:
+    """Runs the controller on a batch of candidates without physics."""
+
+    def __init__(self, table: SceneTable, robot: RobotModel, cfg: WbcConfig, batch: int, device: str) -> None:
+        self.table, self.batch = table, batch
+        self.controller = c = WholeBodyController(robot, batch, table.obstacle_type.shape[1], cfg, device)
+        self.q, self.q_target = wp.to_torch(c.q), wp.to_torch(c.q_target)
+        self.pos, self.quat = wp.to_torch(c.ee_pos), wp.to_torch(c.ee_quat)
+        self.gaze, self.posture = wp.to_torch(c.gaze_point), wp.to_torch(c.q_posture)
+        self.obstacles = tuple(
+            wp.to_torch(a) for a in (c.obstacle_type, c.obstacle_size, c.obstacle_pos, c.obstacle_quat)
+        )
+        self.distance = wp.to_torch(c.min_distance)
+        self.ee = list(c.frame_names).index("ee")
+        self.frame_pos, self.frame_quat = wp.to_torch(c.frame_pos), wp.to_torch(c.frame_quat)
+        wp.to_torch(c.gaze_weight).fill_(1.0)
+        self.home = torch.tensor(robot.q_home, dtype=torch.float32, device=device)
+        self.home[joints.HAND] = torch.tensor(HAND_OPEN, device=device)
+        self.body = torch.as_tensor(joints.WBC, device=device)
+
+    def solve(self, scenes: Tensor, pos: Tensor, quat: Tensor, base: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+        """Joint positions [B,32] and which of them are good [B]."""
+        t, size = self.table, len(scenes)
+        pad = torch.arange(self.batch, device=scenes.device) % size
+        for live, values in zip(
+            self.obstacles, (t.obstacle_type, t.obstacle_size, t.obstacle_pos, t.obstacle_quat), strict=True
+        ):
+            live.copy_(values[scenes[pad]])
+        self.q.copy_(self.home)
+        self.q[:, joints.BASE] = base[pad]
+        self.pos.copy_(pos[pad])
+        self.quat.copy_(quat[pad])
+        self.gaze.copy_(t.target_pos[scenes[pad]])
+        self.posture.copy_(self.q[:, self.body])
+        self.controller.reset(torch.arange(self.batch, device=scenes.device))
+        for _ in range(iterations):
+            self.controller.step()
+            self.q[:, self.body] = self.q_target
+        self.controller.step()
+        error = (self.frame_pos[:, self.ee] - self.pos).norm(dim=-1)
+        angle = quat_log(quat_mul(quat_conj(self.frame_quat[:, self.ee]), self.quat)).norm(dim=-1)
+        good = (error < 0.02) & (angle < 0.15) & (self.distance > 0.005)
+        return self.q[:size].clone(), good[:size].clone()

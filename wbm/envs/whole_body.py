@@ -1,0 +1,130 @@
+"""The whole-body episode: from a start pose away from the support, through free space to a pre-grasp, then the grasp."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from wbm.envs.grasp_env import GraspEnv
+from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
+from wbm.robot import joints
+
+FREE, CONTACT = 0, 1
+NEAR_WAYPOINT = (0.05, 0.3)  # m and rad at which the waypoint counts as passed
+NEAR_PREGRASP = (0.02, 0.15)
+
+
+class WholeBodyEnv(GraspEnv):
+    """`GraspEnv` whose episodes start far away: the controller brings the hand to a pre-grasp, then the policy takes over.
+
+    In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed in the
+    world (a target that followed the base would make the controller chase itself), and the posture is the pre-grasp's. A
+    teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves through both phases alike.
+
+    Attributes:
+        started_near: episodes [N] that started at the pre-grasp.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Arguments as `GraspEnv`."""
+        super().__init__(*args, **kwargs)
+        n, device = self.num_envs, self.device
+        self._near = self.columns.add("near")
+        self._stage = torch.zeros(n, dtype=torch.int64, device=device)
+        self._contact_since = torch.zeros(n, dtype=torch.int64, device=device)
+        self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
+        self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
+        self.started_near = torch.zeros(n, dtype=torch.bool, device=device)
+
+    @property
+    def limit_steps(self) -> int:
+        """Policy steps of approach and grasp together."""
+        return self.max_steps + round(self.cfg.approach_s / self.period)
+
+    def _start_joints(self, ids: Tensor, scenes: Tensor, u: Tensor) -> Tensor:
+        goal = super()._start_joints(ids, scenes, u)
+        near = u[:, self._near].squeeze(1) < self.cfg.pregrasp_share
+        self._goal_q[ids], self.started_near[ids] = goal, near
+        self.phase[ids] = torch.where(near, CONTACT, FREE).to(torch.uint8)
+        self._stage[ids], self._contact_since[ids] = 0, 0
+        away = self.binding.table.q_start[scenes].to(goal)
+        away[:, joints.HAND] = goal[:, joints.HAND]
+        return torch.where(near.unsqueeze(1), goal, away)
+
+    def _begin(self, ids: Tensor) -> None:
+        super()._begin(ids)
+        # The pre-grasp's pose in the world, by the same kinematics that will be asked to reach it.
+        keep = self.q_in.clone()
+        self.q_in[ids] = self._goal_q[ids].to(self.q_in)
+        self.controller.forward_kinematics()
+        ee = self.reader.ee
+        self._goal_pos[ids], self._goal_quat[ids] = self.frame_pos[ids, ee], self.frame_quat[ids, ee]
+        self.q_in.copy_(keep)
+        self.controller.forward_kinematics()
+        self.posture[ids] = self._goal_q[ids][:, self._body].to(self.posture)
+
+    def _contact_steps(self) -> Tensor:
+        return torch.where(self.phase == CONTACT, self.elapsed - self._contact_since, 0)
+
+    def _time_up(self) -> Tensor:
+        return (self._contact_steps() >= self.max_steps) | (self.elapsed >= self.limit_steps)
+
+    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
+        """One policy step with a teacher's action [N,A], which counts in the contact-rich phase only."""
+        action = action.clamp(-self.cfg.action.limit, self.cfg.action.limit)
+        s = self.state
+        self._arrive()
+        contact = (self.phase == CONTACT).unsqueeze(1)
+        action = action * contact
+        self.action.apply(action, s.q, s.ee_pos_w, s.ee_quat)
+        self._approach(~contact.squeeze(1))
+        self._command()
+        return self._advance(action)
+
+    def _errors(self, pos: Tensor, quat: Tensor) -> tuple[Tensor, Tensor]:
+        s = self.state
+        turn = quat_log(quat_mul(quat_conj(s.ee_quat), quat))
+        return (pos - s.ee_pos_w).norm(dim=-1), turn.norm(dim=-1)
+
+    def _waypoint(self) -> Tensor:
+        back = torch.tensor([0.0, 0.0, -self.cfg.approach_back], device=self.device).expand(self.num_envs, 3)
+        return self._goal_pos + rotate(self._goal_quat, back)
+
+    def _arrive(self) -> None:
+        """Move on to the next stage, or to the contact-rich phase, where the hand has arrived."""
+        free = self.phase == FREE
+        distance, angle = self._errors(self._waypoint(), self._goal_quat)
+        passed = free & (self._stage == 0) & (distance < NEAR_WAYPOINT[0]) & (angle < NEAR_WAYPOINT[1])
+        self._stage[passed] = 1
+        distance, angle = self._errors(self._goal_pos, self._goal_quat)
+        arrived = free & (self._stage == 1) & (distance < NEAR_PREGRASP[0]) & (angle < NEAR_PREGRASP[1])
+        ids = arrived.nonzero().squeeze(1)
+        if len(ids):
+            s = self.state
+            self.phase[ids], self._contact_since[ids] = CONTACT, self.elapsed[ids]
+            self.action.reset(ids, s.q[ids].float(), s.ee_pos_w[ids], s.ee_quat[ids])
+
+    def _approach(self, free: Tensor) -> None:
+        """Lead the targets of the environments in free space towards waypoint and pre-grasp."""
+        c, s, term = self.cfg, self.state, self.action
+        goal = torch.where((self._stage == 0).unsqueeze(1), self._waypoint(), self._goal_pos)
+        ahead = _towards(term.pos, goal, c.approach_speed * self.period)
+        ahead = s.ee_pos_w + _towards(torch.zeros_like(ahead), ahead - s.ee_pos_w, c.approach_leash)
+        turn = quat_log(quat_mul(quat_conj(term.quat), self._goal_quat))
+        turned = quat_mul(term.quat, quat_exp(_towards(torch.zeros_like(turn), turn, c.approach_turn * self.period)))
+        keep = (~free).unsqueeze(1)
+        term.velocity.copy_(torch.where(keep, term.velocity, (ahead - term.pos) / self.period))
+        term.pos.copy_(torch.where(keep, term.pos, ahead))
+        term.quat.copy_(torch.where(keep, term.quat, turned / turned.norm(dim=-1, keepdim=True)))
+        hand = self._goal_q[:, joints.HAND].to(term.hand.target)
+        term.hand.target.copy_(torch.where(keep, term.hand.target, hand))
+
+
+def _towards(start: Tensor, goal: Tensor, step: float) -> Tensor:
+    """Points [N,3] at most `step` from `start` on the way to `goal`."""
+    delta = goal - start
+    return start + delta * (step / delta.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
+
+

@@ -1,0 +1,53 @@
+"""Checkpoints of a teacher's training: networks, optimiser, random states and environments, so that resuming is exact."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+
+import torch
+from rsl_rl.algorithms import PPO
+
+from wbm.envs.grasp_env import GraspEnv
+
+
+def save_checkpoint(
+    path: Path, alg: PPO, env: GraspEnv, curve: dict[str, list[float]], iteration: int, best: float, stale: int
+) -> None:
+    """Write everything that the next iteration depends on, atomically."""
+    state = {
+        **alg.save(),
+        "learning_rate": alg.learning_rate,
+        "rng": torch.get_rng_state(),
+        "env": env.state_dict(),
+        "curve": curve,
+        "iteration": iteration,
+        "best": best,
+        "stale": stale,
+    }
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    partial = path.with_name(path.name + ".partial")
+    with open(partial, "wb") as stream:
+        stream.write(buffer.getbuffer())
+        stream.flush()
+        os.fsync(stream.fileno())
+    os.replace(partial, path)
+
+
+def load_checkpoint(path: Path, alg: PPO, env: GraspEnv, curve: dict[str, list[float]]) -> tuple[int, float, int]:
+    """Restore a checkpoint where there is one; fills `curve`.
+
+    Returns:
+        The iteration to go on with, the best evaluation so far (-1 before the first), evaluations since then.
+    """
+    if not path.is_file():
+        return 0, -1.0, 0
+    state = torch.load(path, weights_only=True, map_location=env.device)
+    alg.load(state, None, strict=True)
+    alg.learning_rate = state["learning_rate"]
+    env.load_state_dict(state["env"])
+    torch.set_rng_state(state["rng"].cpu())
+    curve.update(state["curve"])
+    return state["iteration"], state["best"], state["stale"]
