@@ -4,7 +4,7 @@ min 1/2 sum_r w_r (J_r qd - v_r)^2 + 1/2 sum_i (h_i qd_i^2 - 2 g_i qd_i) + 1/2 r
 subject to low <= qd <= high, A_k qd + s_k >= b_k, s_k >= 0
 """
 
-# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import wbc_objectives as obj
