@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from wbm.control.config import WbcConfig
-from wbm.control.tables import build_tables
+from wbm.control.tables import build_tables, neck_pan
 from wbm.kernels import (
     distance,
     kinematics,
@@ -20,7 +20,7 @@ from wbm.kernels import (
     wbc_paper,
     wbc_qp,
 )
-from wbm.robot.joints import WBC
+from wbm.robot.joints import NECK, WBC
 from wbm.robot.model import RobotModel
 from wbm.robot.spheres import SphereSet, robot_spheres, self_pairs
 
@@ -192,6 +192,9 @@ class WholeBodyController:
         frames = wbc_assemble.Frames()
         frames.ee, frames.camera = (self.frame_names.index(n) for n in ("ee", "camera"))
         frames.ee_mask, frames.camera_mask = (t.frame_mask[n] for n in ("ee", "camera"))
+        frames.base = self.frame_names.index("base")
+        frames.pan = int(np.flatnonzero(NECK.start == WBC)[0])
+        frames.pan_mount, frames.pan_zero = neck_pan(robot)
         self._frames = frames
 
     def _allocate_inputs(self) -> None:
