@@ -292,12 +292,12 @@ def place_instances(
 
 @wp.func
 def is_leaving(kind: int, o: wp.vec3, size: wp.vec3, axis: wp.vec3, cos_half: float, sin_half: float) -> bool:
-    """Whether a face's outer half space holds the origin and every ray of a cone leads further out; instance frame.
+    """Whether a flat face's outer half space holds the origin and every ray of a cone leads further out.
+
+    For a box, a plane and the ends of a cylinder, in the instance's frame.
 
     The least component of a cone's directions along a face normal n is `cos(angle(axis, n) + half)`.
     """
-    if kind == CAPSULE or kind == SPHERE or kind == MESH:
-        return False
     for i in range(3):
         extent = size[i]
         if kind == PLANE:
@@ -361,8 +361,12 @@ def cull_bundles(
             s = int(group_scratch[env, h, m])
             key = near[env, s]
             if key <= 0.0 or cones_meet(slot_cone[env, s], c4[3], axis):
-                ahead = rot[env, s] * axis
-                if c4[3] < 0.0 or not is_leaving(kind[env, s], origin[env, s], size[env, s], ahead, c4[3], sin_half):
+                leaving = bool(False)
+                shape = kind[env, s]
+                if c4[3] > 0.0 and (shape == BOX or shape == PLANE or shape == CYLINDER):
+                    ahead = rot[env, s] * axis
+                    leaving = is_leaving(shape, origin[env, s], size[env, s], ahead, c4[3], sin_half)
+                if not leaving:
                     j = int(num)
                     while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
                         cand_out[env, g, j] = cand_out[env, g, j - 1]
@@ -409,7 +413,8 @@ def trace_rays(
     for k in range(first, end):
         best_scratch[env, k] = max_range
         inst_scratch[env, k] = -1
-    # An instance's data is loaded once for all rays of the thread; it may stop when all hits lie before the next one.
+    # A sphere is loaded once for all rays of the thread, which stops when all its hits lie before the next sphere. The
+    # rest of an instance's data is left in memory until a ray meets its sphere.
     farthest = float(max_range)
     for j in range(cand_count[env, g]):
         s = int(cand[env, g, j])
@@ -418,12 +423,6 @@ def trace_rays(
             break
         s4 = sphere[env, s]
         centre = wp.vec3(s4[0], s4[1], s4[2])
-        inst = slot_inst[env, s]
-        shape = kind[env, s]
-        R_IS = rot[env, s]
-        o = origin[env, s]
-        extent = size[env, s]
-        mesh_id = mesh[env, s]
         farthest = float(0.0)
         for k in range(first, end):
             best = best_scratch[env, k]
@@ -431,11 +430,11 @@ def trace_rays(
                 d = direction[row, k]
                 along = wp.dot(centre, d)
                 if s4[3] <= 0.0 or (along > 0.0 and along * along >= s4[3]):
-                    t = ray_instance(shape, o, R_IS * d, extent, mesh_id, best)
+                    t = ray_instance(kind[env, s], origin[env, s], rot[env, s] * d, size[env, s], mesh[env, s], best)
                     if t < best:
                         best = t
                         best_scratch[env, k] = t
-                        inst_scratch[env, k] = inst
+                        inst_scratch[env, k] = slot_inst[env, s]
             farthest = wp.max(farthest, best)
     for k in range(first, end):
         out = order[row, k]
