@@ -59,7 +59,7 @@ ci: check test
 # The built wheel alone, in an empty environment, outside the checkout.
 wheel-test: setup
 	rm -rf build/wheel && mkdir -p build/wheel
-	$(BIN)/python -m build --wheel --outdir build/wheel/dist .
+	$(BIN)/python -m build --wheel --no-isolation --outdir build/wheel/dist .
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/pip install --quiet -c constraints.txt build/wheel/dist/*.whl
 	cd build/wheel && venv/bin/wbm plan profile=smoke && venv/bin/wbm run profile=smoke

@@ -33,7 +33,7 @@ DISTRIBUTIONS = {
     "pybullet_data": "pybullet", "rsl_rl": "rsl-rl-lib", "sentence_transformers": "sentence-transformers",
     "warp": "warp-lang", "yaml": "pyyaml",
 }  # fmt: skip
-_MODULE_STRING = re.compile(r"(?:wbm|stages)(?:\.\w+)+(?::\w+)?")
+_MODULE_STRING = re.compile(r"[A-Za-z_]\w*(?:\.\w+)+(?::\w+)?")
 _DATA_STRING = re.compile(r"[\w.-]+\.[A-Za-z0-9]{1,8}")
 
 
@@ -58,7 +58,8 @@ class Code:
 @dataclass(frozen=True)
 class _Module:
     digest: str
-    imports: tuple[str, ...]  # dotted names, own and foreign, most specific first
+    imports: tuple[str, ...]  # dotted names, own and foreign
+    strings: tuple[str, ...]  # strings that may be dotted names
     data: tuple[str, ...]  # file names
 
 
@@ -97,7 +98,7 @@ def code_of(module: str, base: Path | None = None, roots: tuple[str, ...] = ROOT
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         parsed = _parse(path.read_bytes(), package)
         files[path.relative_to(base).as_posix()] = parsed.digest
-        todo += parsed.imports
+        todo += [*parsed.imports, *(text for text in parsed.strings if text.split(".")[0] in roots)]
         for data in parsed.data:
             for candidate in (path.parent / data, path.parent / "data" / data, path.parent / "templates" / data):
                 if candidate.is_file() and candidate.suffix != ".py":
@@ -117,6 +118,7 @@ def _source(base: Path, name: str) -> Path | None:
 def _parse(source: bytes, package: str) -> _Module:
     tree = ast.parse(source)
     imports: list[str] = []
+    strings: set[str] = set()
     data: set[str] = set()
     _strip(tree)
     for node in ast.walk(tree):
@@ -128,10 +130,10 @@ def _parse(source: bytes, package: str) -> _Module:
             imports += [f"{stem}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             if _MODULE_STRING.fullmatch(node.value):
-                imports.append(node.value.replace(":", "."))
-            elif _DATA_STRING.fullmatch(node.value):
+                strings.add(node.value.replace(":", "."))
+            if _DATA_STRING.fullmatch(node.value):
                 data.add(node.value)
-    return _Module(digest_bytes(ast.dump(tree).encode()), tuple(imports), tuple(sorted(data)))
+    return _Module(digest_bytes(ast.dump(tree).encode()), tuple(imports), tuple(sorted(strings)), tuple(sorted(data)))
 
 
 def _strip(tree: ast.AST) -> None:

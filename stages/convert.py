@@ -108,7 +108,9 @@ def _convert_dataclass(cls: type, value: Any, where: str) -> Any:
     try:
         return cls(**kwargs)
     except ValueError as error:
-        raise ConfigError(f"{where or 'configuration'}: {error}") from error
+        text = str(error)
+        named = not where or text.startswith((f"{where}.", f"{where}:"))
+        raise ConfigError(text if named else f"{where}: {text}") from error
 
 
 def _convert_union(args: tuple[Any, ...], value: Any, where: str, hint: Any) -> Any:

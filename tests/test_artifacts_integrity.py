@@ -229,7 +229,7 @@ def test_a_read_only_store_says_so_and_still_reads(small_disk):
     store = Store.open(small_disk)
     assert store.resolve("assets").ref == artifact.ref
     assert store.verify() == []
-    with pytest.raises(ArtifactError, match="cannot write .*artifacts.root=DIR"):
+    with pytest.raises(ArtifactError, match=r"cannot write .*artifacts\.root=DIR"):
         store.begin(manifest(seed=1))
 
 

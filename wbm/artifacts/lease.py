@@ -19,6 +19,7 @@ from wbm.artifacts.backend import ABSENT, Backend
 from wbm.artifacts.errors import Conflict
 
 TERM_S = 60.0
+_ACTIVE: set[str] = set()  # nonces of the leases that this process holds
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class Holder:
         """True when the process table of this very host and boot shows that the holder is gone."""
         if self.host != socket.gethostname():
             return False
+        if self.boot == _boot_id() and self.pid == os.getpid() and self.nonce not in _ACTIVE:
+            return True  # released by this process, though a full disk kept it from saying so
         return self.boot != _boot_id() or _start_time(self.pid) != self.start
 
 
@@ -120,6 +123,7 @@ class Lease:
         """Stop renewing and let others in; the token stays as a mark."""
         self._stop.set()
         self._thread.join()
+        _ACTIVE.discard(self._record.holder.nonce if self._record.holder else "")
         try:
             self.check()
             self._backend.write(self._path, replace(self._record, holder=None).to_bytes(), self._version)
@@ -149,11 +153,16 @@ def acquire(backend: Backend, path: str, *, wait_s: float = 0.0) -> Lease:
         if current and (current.token, current.beat) != watched:
             watched, watched_since = (current.token, current.beat), now
         if holder is None or holder.known_dead() or now - watched_since > TERM_S:
-            fresh = _Record((current.token if current else 0) + 1, 0, Holder.here())
+            here = Holder.here()
+            fresh = _Record((current.token if current else 0) + 1, 0, here)
+            _ACTIVE.add(here.nonce)  # before others can read it
             try:
                 backend.write(path, fresh.to_bytes(), found[1] if found else ABSENT)
-            except Conflict:
-                continue
+            except BaseException as error:
+                _ACTIVE.discard(here.nonce)
+                if isinstance(error, Conflict):
+                    continue
+                raise
             return Lease(backend, path, fresh)
         if now >= deadline:
             raise Conflict(

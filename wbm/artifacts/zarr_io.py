@@ -71,6 +71,8 @@ def create(folder: Path, arrays: Mapping[str, ArraySpec], attrs: Mapping[str, An
             fill_value=0,
             attributes=dict(spec.attrs or {}),
         )
+    fsync_tree(folder)
+    fsync_path(folder.parent)
     return group
 
 
@@ -80,6 +82,7 @@ def write_shard(group: zarr.Group, index: int, data: Mapping[str, np.ndarray]) -
     Raises:
         ValueError: the data does not fill the shard.
     """
+    root = getattr(group.store, "root", None)
     for name, values in data.items():
         array = group[name]
         assert isinstance(array, zarr.Array) and array.shards is not None
@@ -88,15 +91,11 @@ def write_shard(group: zarr.Group, index: int, data: Mapping[str, np.ndarray]) -
         if values.shape != (stop - start, *array.shape[1:]):
             raise ValueError(f"{name}: shard {index} has shape {(stop - start, *array.shape[1:])}, got {values.shape}")
         array.with_config({"write_empty_chunks": True})[start:stop] = values  # the setting is not stored in the group
-    fsync_group(group)
-
-
-def fsync_group(group: zarr.Group) -> None:
-    """Flush all files of a group on the local disk."""
-    root = getattr(group.store, "root", None)
-    if root is not None:
-        fsync_tree(Path(root))
-        fsync_path(Path(root).parent)
+        if root is not None:
+            shards = Path(root) / array.path / "c"
+            fsync_tree(shards / str(index)) if (shards / str(index)).is_dir() else fsync_path(shards / str(index))
+            fsync_path(shards)
+            fsync_path(shards.parent)
 
 
 def open_group(folder: Path, manifest: Manifest) -> zarr.Group:

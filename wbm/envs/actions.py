@@ -12,9 +12,13 @@ from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
-HAND_OPEN = (0.3, 0.0, 0.5, 0.4) * 3 + (1.3, 0.4, 0.1, 0.1)
-HAND_CLOSED = (1.3, 0.0, 0.9, 0.7) * 3 + (1.3, 0.4, 0.9, 0.8)
-"""Ends of the closure synergy: index, middle, ring, thumb (4 joints each, rad)."""
+HAND_OPEN = (0.35, 0.0, 0.70, 0.50) * 3 + (0.85, 1.68, 0.68, 1.15)
+HAND_CLOSED = (1.20, 0.0, 0.95, 0.60) * 3 + (1.60, 0.35, 0.56, 0.25)
+"""Ends of the closure synergy: index, middle, ring, thumb (4 joints each, rad).
+
+Found by fingertip inverse kinematics: on the way from open to closed the fingers' tips move from x = 9 cm to -1 cm and
+the thumb's from -6 cm to 0 in the grasp frame, all near z = 3 cm, so that they meet an object at its centre.
+"""
 
 NUM_HAND = 16
 EE_LABELS = tuple(f"ee_{kind}_{axis}" for kind in ("move", "turn") for axis in "xyz")
@@ -64,14 +68,15 @@ class WbcAction:
 
     STATE = ("pos", "quat")
 
-    def __init__(self, cfg: ActionConfig, robot: RobotModel, num_envs: int, device: str) -> None:
-        self.cfg = cfg
+    def __init__(self, cfg: ActionConfig, robot: RobotModel, num_envs: int, period: float, device: str) -> None:
+        self.cfg, self.period = cfg, period
         self.hand = HandAction(cfg, robot, num_envs, device)
         self.labels = EE_LABELS + self.hand.labels
         self.offset_labels = tuple(f"ee_offset_{kind}_{axis}" for kind in ("pos", "rot") for axis in "xyz")
         self.pos = torch.zeros(num_envs, 3, device=device)
         self.quat = torch.zeros(num_envs, 4, device=device)
         self.quat[:, 0] = 1.0
+        self.velocity = torch.zeros(num_envs, 3, device=device)
 
     def reset(self, ids: Tensor, q: Tensor, ee_pos: Tensor, ee_quat: Tensor) -> None:
         """Put the targets of environments `ids` onto the present state (`q` [K,32], `ee_pos` [K,3], `ee_quat` [K,4])."""
@@ -83,7 +88,9 @@ class WbcAction:
         c = self.cfg
         self.hand.apply(action[:, 6:], q)
         shift = self.pos + rotate(self.quat, c.ee_step * action[:, 0:3]) - ee_pos
-        self.pos.copy_(ee_pos + _shorten(shift, c.ee_leash))
+        pos = ee_pos + _shorten(shift, c.ee_leash)
+        self.velocity.copy_((pos - self.pos) * (c.feed_forward / self.period))
+        self.pos.copy_(pos)
         turned = quat_mul(self.quat, quat_exp(c.ee_turn * action[:, 3:6]))
         turn = _shorten(quat_log(quat_mul(quat_conj(ee_quat), turned)), c.ee_turn_leash)
         quat = quat_mul(ee_quat, quat_exp(turn))
@@ -92,7 +99,9 @@ class WbcAction:
     def offset(self, q: Tensor, ee_pos: Tensor, ee_quat: Tensor) -> Tensor:
         """Target pose relative to the hand, in the grasp frame [N,6]: m and rad, scaled to order one."""
         inverse = quat_conj(ee_quat)
-        return torch.cat([20.0 * rotate(inverse, self.pos - ee_pos), 3.0 * quat_log(quat_mul(inverse, self.quat))], dim=-1)
+        return torch.cat(
+            [20.0 * rotate(inverse, self.pos - ee_pos), 3.0 * quat_log(quat_mul(inverse, self.quat))], dim=-1
+        )
 
 
 class JointAction:
@@ -100,7 +109,7 @@ class JointAction:
 
     STATE = ("target",)
 
-    def __init__(self, cfg: ActionConfig, robot: RobotModel, num_envs: int, device: str) -> None:
+    def __init__(self, cfg: ActionConfig, robot: RobotModel, num_envs: int, period: float, device: str) -> None:
         self.cfg = cfg
         self.hand = HandAction(replace(cfg, hand="joints"), robot, num_envs, device)
         self.labels = joints.JOINT_NAMES
@@ -134,12 +143,13 @@ class JointAction:
         return (self.target - q[:, self.body]) / self.leash
 
 
-def make_action(cfg: ActionConfig, robot: RobotModel, num_envs: int, device: str) -> WbcAction | JointAction:
-    """The action term that `cfg.term` names."""
-    return (WbcAction if cfg.term == "wbc" else JointAction)(cfg, robot, num_envs, device)
+def make_action(
+    cfg: ActionConfig, robot: RobotModel, num_envs: int, period: float, device: str
+) -> WbcAction | JointAction:
+    """The action term that `cfg.term` names, for a policy period of `period` seconds."""
+    return (WbcAction if cfg.term == "wbc" else JointAction)(cfg, robot, num_envs, period, device)
 
 
 def _shorten(v: Tensor, limit: float) -> Tensor:
     """Vectors [N,3] no longer than `limit`."""
     return v * (limit / v.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
-

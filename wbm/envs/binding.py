@@ -1,14 +1,16 @@
-"""What the environment needs from scenes: one compiled model and how a record is loaded into environments."""
+"""Joins scenes to running environments: which scenes are played, and what each one means for state and controller."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
-import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
+from wbm.scenes.bank import SceneBank, obstacle_boxes
+from wbm.scenes.config import KINDS
+from wbm.scenes.model import SceneModel
 from wbm.sim.simulation import Simulation
 
 
@@ -17,19 +19,24 @@ class SceneTable:
     """Per-scene tensors of S scenes, gathered once; an environment's scene is an index into them.
 
     Attributes:
-        target_pos: settled position of the target's body origin [S,3], m.
+        target_pos: settled position of the target's frame [S,3], m: the centre of its bounding box.
         target_quat: settled orientation [S,4].
-        box_centre: centre of the target's bounding box in its body frame [S,3], m.
-        box_half: half extents of that box [S,3], m.
+        box_half: half extents of the bounding box in the target's frame [S,3], m.
         support_height: height of the surface that the target settled on [S], m.
-        obstacle_type, obstacle_size, obstacle_pos, obstacle_quat: the controller's obstacles [S,M,...].
+        ceiling_height: height of what is above it [S], m; inf where nothing is.
+        base: base x, y, yaw from which the target is in reach [S,3].
+        q_start: collision-free joint positions away from the support [S,32].
+        obstacle_type, obstacle_size, obstacle_pos, obstacle_quat: the controller's obstacles [S,M,...]; the target's own
+            boxes are unused.
     """
 
     target_pos: Tensor
     target_quat: Tensor
-    box_centre: Tensor
     box_half: Tensor
     support_height: Tensor
+    ceiling_height: Tensor
+    base: Tensor
+    q_start: Tensor
     obstacle_type: Tensor
     obstacle_size: Tensor
     obstacle_pos: Tensor
@@ -41,22 +48,76 @@ class SceneTable:
         return len(self.target_pos)
 
 
-class SceneBinding(Protocol):
-    """A model for all scenes, and records that are written into environments of a running simulation."""
+class SceneBinding:
+    """A compiled model and the scenes of a bank that are played in it.
 
-    model: mujoco.MjModel
-    table: SceneTable
-    target_body: int
-    target_geoms: tuple[int, ...]
-    target_qpos: slice
-    target_dofs: slice
-    num_distractors: int
+    Attributes:
+        model: the template `MjModel`.
+        scenes: rows of the bank [S]; everything else counts scenes by their place in this list.
+        table: per-scene tensors.
+        target_geoms: geom ids of the target's slots; target_qpos, target_dofs: its columns in qpos and qvel.
+        num_distractors: free bodies besides the target.
+    """
 
-    def load(self, sim: Simulation, ids: Tensor, scenes: Tensor) -> None:
-        """Write model fields and object poses of `scenes` [K] into environments `ids` [K]; no `set_const`, no `forward`."""
-        ...
+    def __init__(self, scene_model: SceneModel, bank: SceneBank, scenes: np.ndarray, device: str = "cpu") -> None:
+        if len(scenes) == 0:
+            raise ValueError("no scene is left to play: widen teacher.supports or the split, or prepare more assets")
+        self.scene_model, self.bank, self.scenes = scene_model, bank, np.asarray(scenes)
+        self.model = scene_model.model
+        self.target_geoms = tuple(int(g) for g in scene_model.slot_geoms[0])
+        start = scene_model.robot_nq
+        self.target_qpos, self.target_dofs = slice(start, start + 7), slice(start, start + 6)
+        self.num_distractors = scene_model.cfg.num_distractors
+        self.table = self._tabulate(device)
+
+    def load(self, sim: Simulation, ids: Tensor, scenes: Tensor, mass_scale: Tensor, friction: Tensor | None) -> None:
+        """Write model fields and object poses of `scenes` [K] into environments `ids` [K]; `set_const` is not needed.
+
+        Args:
+            mass_scale: factor on the objects' masses [K].
+            friction: sliding friction of the objects [K], or None for the template's.
+        """
+        self.scene_model.load_scene(
+            sim.field,
+            sim.qpos,
+            ids.cpu().numpy(),
+            self.bank,
+            self.scenes[scenes.cpu().numpy()],
+            mass_scale.cpu().numpy(),
+            None if friction is None else friction.cpu().numpy(),
+        )
+
+    def _tabulate(self, device: str) -> SceneTable:
+        bank, rows, objects = self.bank, self.scenes, self.scene_model.objects
+        boxes = obstacle_boxes(bank, objects, rows, with_target=False)
+        pos, quat = boxes.world(bank.object_pos[rows], bank.object_quat[rows])
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32, device=device)
+
+        return SceneTable(
+            target_pos=tensor(bank.object_pos[rows, 0]),
+            target_quat=tensor(bank.object_quat[rows, 0]),
+            box_half=tensor(objects.half_extent[bank.object[rows, 0]]),
+            support_height=tensor(bank.surface_z[rows]),
+            ceiling_height=tensor(bank.ceiling_z[rows]),
+            base=tensor(bank.base_grasp[rows]),
+            q_start=tensor(bank.q_start[rows]),
+            obstacle_type=torch.as_tensor(boxes.type, dtype=torch.int32, device=device),
+            obstacle_size=tensor(boxes.size),
+            obstacle_pos=tensor(pos),
+            obstacle_quat=tensor(quat),
+        )
 
 
-def target_centre(pos: Tensor, quat_mat: Tensor, box_centre: Tensor) -> Tensor:
-    """World position [N,3] of the bounding box's centre."""
-    return pos + torch.einsum("nij,nj->ni", quat_mat, box_centre)
+def choose_scenes(bank: SceneBank, split: str, supports: tuple[str, ...], grasp: str) -> np.ndarray:
+    """Scenes of a split and of some support kinds whose hint is the given grasp.
+
+    Raises:
+        ValueError: none is left.
+    """
+    rows = bank.where(split, tuple(KINDS.index(s) for s in supports))
+    rows = rows[bank.approach[rows] == ("top_down", "side").index(grasp)]
+    if len(rows) == 0:
+        raise ValueError(f"the assets hold no {split} scene on {', '.join(supports)} for a {grasp} grasp")
+    return rows

@@ -17,6 +17,7 @@ class ActionConfig:
         ee_turn: the same for rotation, rad a step.
         ee_leash: the target stays within this distance of the hand, m.
         ee_turn_leash: the same for rotation, rad.
+        feed_forward: share of the target's own velocity that the controller is told.
         hand_step: hand joint motion at an action of 1, rad a step, for each joint's own value.
         closure_step: the same for the common closure.
         finger_step: the same for a finger's closure.
@@ -33,6 +34,7 @@ class ActionConfig:
     ee_turn: float = 0.06
     ee_leash: float = 0.06
     ee_turn_leash: float = 0.35
+    feed_forward: float = 0.8
     hand_step: float = 0.06
     closure_step: float = 0.10
     finger_step: float = 0.08
@@ -126,8 +128,7 @@ class RandomizationConfig:
         start_tilt: pre-grasp rotation about the grasp frame's x and y, rad.
         start_yaw: pre-grasp rotation about the approach direction, rad.
         start_hand: offset of each hand joint at the start, rad.
-        start_distance: distance of the base from its pre-grasp place in whole-body episodes, m.
-        start_heading: base yaw error in whole-body episodes, rad.
+        start_arm: offset of each arm joint at the start of whole-body episodes, rad.
         scene: draw the scene record at random (geometry, pose, support height, clutter); else in order.
     """
 
@@ -140,8 +141,7 @@ class RandomizationConfig:
     start_tilt: Range = field(default_factory=lambda: Range(-0.15, 0.15))
     start_yaw: Range = field(default_factory=lambda: Range(-0.5, 0.5))
     start_hand: Range = field(default_factory=lambda: Range(-0.08, 0.08))
-    start_distance: Range = field(default_factory=lambda: Range(0.3, 0.6))
-    start_heading: Range = field(default_factory=lambda: Range(-0.3, 0.3))
+    start_arm: Range = field(default_factory=lambda: Range(-0.1, 0.1))
     scene: bool = True
 
 

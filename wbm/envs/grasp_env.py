@@ -37,6 +37,7 @@ class GraspEnv:
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
         phase: 0 free space, 1 contact-rich [N].
+        started_near: episodes that started at the pre-grasp [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
     """
 
@@ -64,7 +65,7 @@ class GraspEnv:
         self._pick = self.columns.add("scene")
         self._start = self.columns.add("start")
         self._hand = self.columns.add("start_hand", 16)
-        self.action = make_action(cfg.action, robot, num_envs, device)
+        self.action = make_action(cfg.action, robot, num_envs, self.period, device)
         self.observe = TeacherObservation(robot, self.action.offset_labels, self.action.labels, device)
         self.reader = StateReader(robot, self.sim, self.controller, binding, cfg, self.period)
         self.outcome = Outcome(cfg, self.period, num_envs, device)
@@ -76,6 +77,7 @@ class GraspEnv:
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
         self.next_episode = 0
         self.phase = torch.ones(num_envs, dtype=torch.uint8, device=device)
+        self.started_near = torch.ones(num_envs, dtype=torch.bool, device=device)
 
     @property
     def limit_steps(self) -> int:
@@ -125,7 +127,7 @@ class GraspEnv:
         parts = {"action": self.action, "hand": self.action.hand, "outcome": self.outcome, "reader": self.reader}
         for part, item in parts.items():
             own |= {f"{part}.{name}": value for name, value in vars(item).items() if name in item.STATE}
-        return own | {"controller.qd": self.qd_target, "controller.min_distance": self.min_distance}
+        return own | {f"controller.{name}": tensor for name, tensor in self._controller_state.items()}
 
     def _uniforms(self, episodes: np.ndarray) -> Tensor:
         return torch.from_numpy(episode_uniforms(self.seed, episodes, self.columns.count)).to(self.device)
@@ -133,9 +135,7 @@ class GraspEnv:
     def _load_physics(self, ids: Tensor, u: Tensor, scenes: Tensor) -> None:
         """Write scenes and randomised physics of environments `ids`, with fresh simulation state."""
         self.sim.reset(ids)
-        self.binding.load(self.sim, ids, scenes)
-        self.randomizer.apply(ids, u)
-        self.sim.set_const(ids)
+        self.randomizer.load(ids, scenes, u)
 
     def _begin(self, ids: Tensor) -> None:
         """Start the next episodes in environments `ids` (sorted)."""
@@ -214,12 +214,12 @@ class GraspEnv:
         if self.cfg.action.term == "joint":
             self.ctrl[:, self._body] = term.target
             return
+        self.ee_velocity.copy_(term.velocity)
         self.ee_target.copy_(term.pos)
         self.ee_target_quat.copy_(term.quat)
         self.gaze.copy_(s.obj_pos_w)
         self.controller.step()
-        # The velocity gain would brake the motion that the controller asks for: lead it by kv / kp.
-        self.ctrl[:, self._body] = self.q_target + self._lead * self.qd_target
+        self.ctrl[:, self._body] = self.body_ctrl
         if self.cfg.action.neck == "fixed":
             self.ctrl[:, joints.NECK] = self.posture[:, -6:]
 
@@ -265,7 +265,8 @@ class GraspEnv:
 
     def _wire_controller(self) -> None:
         c = self.controller
-        self.q_in, self.qd_target, self.q_target = wp.to_torch(c.q), wp.to_torch(c.qd), wp.to_torch(c.q_target)
+        self.q_in, self.body_ctrl = wp.to_torch(c.q), wp.to_torch(c.ctrl)
+        self.ee_velocity = wp.to_torch(c.ee_lin_vel)
         self.ee_target, self.ee_target_quat = wp.to_torch(c.ee_pos), wp.to_torch(c.ee_quat)
         self.gaze, self.posture = wp.to_torch(c.gaze_point), wp.to_torch(c.q_posture)
         self.frame_pos, self.frame_quat = wp.to_torch(c.frame_pos), wp.to_torch(c.frame_quat)
@@ -274,9 +275,10 @@ class GraspEnv:
             wp.to_torch(a) for a in (c.obstacle_type, c.obstacle_size, c.obstacle_pos, c.obstacle_quat)
         )
         wp.to_torch(c.gaze_weight).fill_(0.0 if self.cfg.action.neck == "fixed" else 1.0)
+        self._controller_state = {
+            name: wp.to_torch(getattr(c, name)) for name in ("qd", "q_target", "min_distance", "_fresh")
+        }
         self._body = torch.as_tensor(joints.WBC, device=self.device)
-        lead = self.robot.kv[joints.WBC] / self.robot.kp[joints.WBC]
-        self._lead = torch.tensor(lead, dtype=torch.float32, device=self.device)
 
     def _obstacles(self, ids: Tensor, scenes: Tensor) -> None:
         t = self.binding.table

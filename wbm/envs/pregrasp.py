@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -16,7 +17,7 @@ from wbm.envs.binding import SceneTable
 from wbm.envs.config import EnvConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.randomization import scaled
-from wbm.envs.rotations import quat_exp, quat_log, quat_conj, quat_mul, quat_to_mat, rotate
+from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, quat_to_mat, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
@@ -42,7 +43,6 @@ class StartBank:
         return self.count.nonzero().squeeze(1)
 
 
-
 def grasp_poses(table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u: Tensor) -> tuple[Tensor, Tensor]:
     """Pre-grasp positions [B,3] and orientations [B,4] of the grasp frame, jittered by `u` [B,7].
 
@@ -51,20 +51,21 @@ def grasp_poses(table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u
     """
     r = cfg.randomization
     mat = quat_to_mat(table.target_quat[scenes])
-    centre = table.target_pos[scenes] + (mat @ table.box_centre[scenes].unsqueeze(-1)).squeeze(-1)
+    centre = table.target_pos[scenes]
     extent = mat.abs() @ table.box_half[scenes].unsqueeze(-1)  # half extents along the world's axes
     top = centre[:, 2] + extent[:, 2, 0]
-    flip = torch.where(u[:, 0] < 0.5, 0.0, math.pi)
     if grasp == "top_down":
         shape = (mat * table.box_half[scenes].unsqueeze(1))[:, :2]  # box axes scaled, seen from above [B,2,3]
         spread = shape @ shape.transpose(1, 2)
-        yaw = 0.5 * torch.atan2(2 * spread[:, 0, 1], spread[:, 0, 0] - spread[:, 1, 1]) + math.pi / 2 + flip
+        yaw = 0.5 * torch.atan2(2 * spread[:, 0, 1], spread[:, 0, 0] - spread[:, 1, 1]) + math.pi / 2
+        # Of the two opposite directions the one that points away from the base is in the wrist's reach.
+        yaw = torch.where(torch.cos(yaw - table.base[scenes, 2]) < 0, yaw + math.pi, yaw)
         zero = torch.zeros_like(yaw)
         down = torch.tensor([0.0, 1.0, 0.0, 0.0], device=yaw.device).expand(len(yaw), 4)
         quat = quat_mul(quat_exp(torch.stack([zero, zero, yaw], -1)), down)
         pos = torch.stack([centre[:, 0], centre[:, 1], top + cfg.standoff], -1)
     else:
-        yaw = 2 * math.pi * u[:, 0]
+        yaw = table.base[scenes, 2] + 1.2 * (u[:, 0] - 0.5)  # from where the robot stands
         zero = torch.zeros_like(yaw)
         # Columns x, y, z of the unturned frame: x to the left, y down, z ahead.
         ahead = torch.tensor([0.5, 0.5, 0.5, 0.5], device=yaw.device).expand(len(yaw), 4)
@@ -87,7 +88,7 @@ def solve_starts(
     device: str = "cpu",
     batch: int = 512,
     iterations: int = 120,
-    rounds: int = 6,
+    rounds: int = 4,
 ) -> StartBank:
     """Find `cfg.starts_per_scene` pre-grasps for each scene by running the controller itself, kinematically.
 
@@ -105,35 +106,36 @@ def solve_starts(
     bank = torch.zeros(count, keep, joints.NUM_JOINTS, device=device)
     found = torch.zeros(count, dtype=torch.int64, device=device)
     solver = _Solver(table, robot, wbc_cfg, batch, device)
-    columns = Columns()
+    columns, tried = Columns(), 0
     jitter, stand = columns.add("jitter", 7), columns.add("stand", 3)
-    for attempt in range(rounds * keep):
-        open_scenes = (found < keep).nonzero().squeeze(1)
-        if len(open_scenes) == 0:
-            break
-        for part in open_scenes.split(batch):
-            keys = part.cpu().numpy() + attempt * count
-            u = torch.from_numpy(episode_uniforms(seed, keys, columns.count)).to(device)
+    for _ in range(rounds):
+        # Every scene that lacks starts gets as many candidates as it lacks, interleaved so that all scenes progress.
+        lacking = torch.cat([(found < keep - k).nonzero().squeeze(1) for k in range(keep)])
+        for first in range(0, len(lacking), batch):
+            part = lacking[first : first + batch]
+            u = torch.from_numpy(episode_uniforms(seed, np.arange(tried, tried + len(part)), columns.count)).to(device)
+            tried += len(part)
             pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter])
-            q, good = solver.solve(part, pos, quat, stand_poses(pos, quat, grasp, u[:, stand]), iterations)
-            ok = part[good]
-            bank[ok, found[ok]] = q[good]
-            found[ok] += 1
+            q, good = solver.solve(part, pos, quat, stand_poses(table.base[part], u[:, stand]), iterations)
+            for scene, row in zip(part[good].tolist(), q[good], strict=True):
+                if found[scene] < keep:
+                    bank[scene, found[scene]] = row
+                    found[scene] += 1
     if int(found.max()) == 0:
-        raise ValueError(f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff")
+        raise ValueError(
+            f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff"
+        )
     return StartBank(bank, found)
 
 
-def stand_poses(pos: Tensor, quat: Tensor, grasp: str, u: Tensor) -> Tensor:
-    """Base poses [B,3] (x, y, yaw) that face the grasp pose: from any side (top_down) or from behind the hand (side)."""
-    ahead = rotate(quat, torch.tensor([0.0, 0.0, 1.0], device=pos.device).expand_as(pos))
-    heading = 2 * math.pi * u[:, 0]
-    if grasp == "side":
-        heading = torch.atan2(ahead[:, 1], ahead[:, 0]) + 0.6 * (u[:, 0] - 0.5)
-    reach = 0.60 + 0.15 * u[:, 1]
-    x, y = pos[:, 0] - reach * torch.cos(heading), pos[:, 1] - reach * torch.sin(heading)
-    yaw = torch.remainder(heading + 0.3 * (u[:, 2] - 0.5) + math.pi, 2 * math.pi) - math.pi
-    return torch.stack([x, y, yaw], -1)
+def stand_poses(base: Tensor, u: Tensor) -> Tensor:
+    """Base poses [B,3] (x, y, yaw) near the scenes' own grasp places, jittered by `u` [B,3]."""
+    spread = torch.tensor([0.10, 0.20, 0.30], device=base.device)
+    offset = spread * (u - 0.5)
+    c, s = torch.cos(base[:, 2]), torch.sin(base[:, 2])
+    x = base[:, 0] + c * offset[:, 0] - s * offset[:, 1]
+    y = base[:, 1] + s * offset[:, 0] + c * offset[:, 1]
+    return torch.stack([x, y, base[:, 2] + offset[:, 2]], -1)
 
 
 class _Solver:

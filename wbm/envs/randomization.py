@@ -21,33 +21,34 @@ class Randomizer:
 
     def __init__(self, cfg: RandomizationConfig, sim: Simulation, binding: SceneBinding, columns: Columns) -> None:
         self.cfg, self.sim, self.binding = cfg, sim, binding
-        self.columns = {name: columns.add(name) for name in ("friction", "mass", "arm_gain", "hand_gain", "contact_time")}
+        self.columns = {
+            name: columns.add(name) for name in ("friction", "mass", "arm_gain", "hand_gain", "contact_time")
+        }
         self._gain = torch.as_tensor(np.asarray(binding.model.actuator_gainprm))
         self._bias = torch.as_tensor(np.asarray(binding.model.actuator_biasprm))
 
-    def apply(self, ids: Tensor, uniforms: Tensor) -> None:
-        """Write the draws of environments `ids` [K] from `uniforms` [K,D], after their scenes were loaded."""
+    def load(self, ids: Tensor, scenes: Tensor, uniforms: Tensor) -> None:
+        """Load `scenes` [K] into environments `ids` [K] with the physics that `uniforms` [K,D] draw."""
         c = self.cfg
         draw = {name: uniforms[:, column].squeeze(1) for name, column in self.columns.items()}
-        geoms = torch.tensor(self.binding.target_geoms, device=ids.device)
-        at = (ids.unsqueeze(1), geoms.unsqueeze(0))
-        if c.friction.on:
-            self.sim.field("geom_friction")[(*at, 0)] = _double(scaled(c.friction, draw["friction"])).unsqueeze(1)
+        mass = scaled(c.mass, draw["mass"]) if c.mass.on else torch.ones_like(draw["mass"])
+        friction = scaled(c.friction, draw["friction"]) if c.friction.on else None
+        self.binding.load(self.sim, ids, scenes, mass, friction)
         if c.contact_time.on:
-            self.sim.field("geom_solref")[(*at, 0)] = _double(scaled(c.contact_time, draw["contact_time"])).unsqueeze(1)
-        if c.mass.on:
-            factor = _double(scaled(c.mass, draw["mass"]))
-            self.sim.field("body_mass")[ids, self.binding.target_body] *= factor
-            self.sim.field("body_inertia")[ids, self.binding.target_body] *= factor.unsqueeze(1)
+            geoms = torch.tensor(self.binding.target_geoms, device=ids.device)
+            times = scaled(c.contact_time, draw["contact_time"]).unsqueeze(1)
+            solref = self.sim.field("geom_solref")
+            solref[ids.unsqueeze(1), geoms, 0] = times.to(solref).expand(-1, len(geoms))
         for item, name, group in ((c.arm_gain, "arm_gain", joints.WBC), (c.hand_gain, "hand_gain", np.r_[joints.HAND])):
             if item.on:
-                self._write_gain(ids, torch.as_tensor(group), _double(scaled(item, draw[name])))
+                self._write_gain(ids, torch.as_tensor(group), scaled(item, draw[name]))
 
     def _write_gain(self, ids: Tensor, actuators: Tensor, factor: Tensor) -> None:
         at = (ids.unsqueeze(1), actuators.unsqueeze(0))
         gain, bias = self.sim.field("actuator_gainprm"), self.sim.field("actuator_biasprm")
-        gain[(*at, 0)] = (self._gain[actuators, 0] * factor.unsqueeze(1)).to(gain)
-        bias[at] = (self._bias[actuators] * factor.view(-1, 1, 1)).to(bias)
+        factor = factor.to(gain)
+        gain[(*at, 0)] = self._gain[actuators, 0].to(gain) * factor.unsqueeze(1)
+        bias[at] = self._bias[actuators].to(bias) * factor.view(-1, 1, 1)
 
 
 def scaled(item: Range, uniform: Tensor) -> Tensor:
@@ -55,7 +56,3 @@ def scaled(item: Range, uniform: Tensor) -> Tensor:
     if not item.on:
         return torch.full_like(uniform, (item.low + item.high) / 2)
     return item.low + (item.high - item.low) * uniform
-
-
-def _double(x: Tensor) -> Tensor:
-    return x.to(torch.float64)

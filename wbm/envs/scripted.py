@@ -30,7 +30,7 @@ class ScriptedGrasp:
         cfg: ActionConfig,
         reach: float = 0.28,
         close: float = 0.45,
-        depth: float = 0.045,
+        depth: float = 0.05,
         lift: float = 0.6,
     ) -> None:
         if cfg.term != "wbc" or cfg.hand != "mix":

@@ -41,7 +41,7 @@ class StateReader:
         self.tips = torch.tensor([names.index(f"tip_{f}") for f in joints.FINGERS], device=sim.device)
         n, device = sim.num_envs, sim.device
         self.start_pos, self.support = torch.zeros(n, 3, device=device), torch.zeros(n, device=device)
-        self.box_centre, self.box_half = torch.zeros(n, 3, device=device), torch.zeros(n, 3, device=device)
+        self.box_half = torch.zeros(n, 3, device=device)
         hand = [f"hand_distractor_{i}" for i in range(binding.num_distractors)]
         robot_all = [f"robot_distractor_{i}" for i in range(binding.num_distractors)]
         rows = [f"finger_{f}" for f in joints.FINGERS]
@@ -56,10 +56,9 @@ class StateReader:
     def begin(self, ids: Tensor, scenes: Tensor) -> None:
         """Remember the settled target of `scenes` [K] for environments `ids` [K]."""
         t = self.binding.table
-        self.box_centre[ids], self.box_half[ids], self.support[ids] = t.box_centre[scenes], t.box_half[scenes], t.support_height[scenes]
+        self.box_half[ids], self.support[ids] = t.box_half[scenes], t.support_height[scenes]
+        self.start_pos[ids] = t.target_pos[scenes]
         self._fresh[ids] = True
-        mat = quat_to_mat(t.target_quat[scenes])
-        self.start_pos[ids] = t.target_pos[scenes] + (mat @ t.box_centre[scenes].unsqueeze(-1)).squeeze(-1)
 
     def read(self, frame_pos: Tensor, frame_quat: Tensor) -> GraspState:
         """State from the simulation and the controller's frames [N,F,3], [N,F,4] at the present joints."""
@@ -70,10 +69,8 @@ class StateReader:
         pose, twist = sim.qpos[:, self.binding.target_qpos], sim.qvel[:, self.binding.target_dofs]
         obj_quat = pose[:, 3:7].clone()
         obj_mat = quat_to_mat(obj_quat)
-        arm = (obj_mat @ self.box_centre.unsqueeze(-1)).squeeze(-1)
-        obj_pos = pose[:, :3] + arm
+        obj_pos, lin_vel = pose[:, :3].clone(), twist[:, :3].clone()
         ang_vel = (obj_mat @ twist[:, 3:6].unsqueeze(-1)).squeeze(-1)  # a free joint's spin is in its own frame
-        lin_vel = twist[:, :3] + torch.linalg.cross(ang_vel, arm)
 
         points = torch.cat([tips, ee_pos.unsqueeze(1)], dim=1)
         gaps = box_gap(points, obj_pos, obj_mat, self.box_half)

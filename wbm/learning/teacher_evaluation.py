@@ -26,7 +26,7 @@ def evaluate_teacher(
     total = torch.zeros(env.num_envs, device=env.device)
     counts, finished, returns, grip, held_steps = torch.zeros(len(REASONS)), 0, 0.0, 0.0, 0.0
     while finished < episodes:
-        with torch.inference_mode():
+        with torch.no_grad():
             obs, reward, done, info = env.step(policy(obs))
         total += reward
         holding = env.state.holding

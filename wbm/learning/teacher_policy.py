@@ -55,7 +55,7 @@ class TeacherPolicy(nn.Module):
             layers += [nn.Linear(before, after), _ACTIVATIONS[spec.activation]()]
         self.mlp = nn.Sequential(*layers, nn.Linear(widths[-1], len(spec.action_labels)))
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def forward(self, obs: Tensor) -> Tensor:
         return self.mlp(obs)
 

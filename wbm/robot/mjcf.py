@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 
 import mujoco
 import numpy as np
 
 from wbm.robot import joints
+from wbm.robot.config import MjcfOptions
 from wbm.robot.model import HINGE, RobotModel, load_robot
+from wbm.robot.spheres import moving_joints
 
 ROBOT_BIT, OBJECT_BIT, STATIC_BIT = 1, 2, 4
 """Collision bits: everything collides with everything, but statics and unused slots not with statics."""
@@ -22,31 +23,7 @@ CONTACT_VALUES = 4
 """Values of one contact sensor: number of contacts, then the net force (N, world frame) on the second body."""
 
 _SAMPLES = 256
-_ALWAYS_TOUCHING = 0.25
-
-
-@dataclass(frozen=True)
-class MjcfOptions:
-    """How the robot becomes MJCF.
-
-    Attributes:
-        arm_armature_extra: added to the published armature of the seven arm joints, kg m^2. The published 0.1 with stiff
-            position gains and force limits falls into a limit cycle at 10 ms steps (torques chatter at their limits).
-        hand_effort: force limit of the hand's actuators, N m; 0 keeps the model's.
-        self_collision: whether links of the robot may touch each other.
-        skin: `primitives`, or `menagerie` for the published meshes as visuals (see `export.py`).
-    """
-
-    arm_armature_extra: float = 2.0
-    hand_effort: float = 0.0
-    self_collision: bool = True
-    skin: str = "primitives"
-
-    def __post_init__(self) -> None:
-        if self.arm_armature_extra < 0 or self.hand_effort < 0:
-            raise ValueError("robot: arm_armature_extra and hand_effort must not be negative")
-        if self.skin not in ("primitives", "menagerie"):
-            raise ValueError(f"robot.skin={self.skin}: use primitives or menagerie")
+_OFTEN_TOUCHING = 0.25
 
 
 def build_robot(spec: mujoco.MjSpec, robot: RobotModel, options: MjcfOptions | None = None) -> None:
@@ -139,10 +116,10 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotModel, options: MjcfOptions)
 
 @cache
 def excluded_pairs(robot: RobotModel, self_collision: bool = True) -> tuple[tuple[str, str], ...]:
-    """Body pairs whose contact is not simulated: those whose primitives touch most of the time.
+    """Body pairs whose contact is not simulated: near neighbours whose primitives touch in many configurations.
 
-    Found by sampling configurations (parents and children are already left out by MuJoCo), seeded. With
-    `self_collision` off, every pair outside the hand is excluded too.
+    Found by sampling configurations (parents and children are already left out by MuJoCo), seeded; near means at most
+    two joints apart. With `self_collision` off, every pair outside the hand is excluded too.
     """
     spec = mujoco.MjSpec()
     _add_links(spec, robot, MjcfOptions())
@@ -160,7 +137,9 @@ def excluded_pairs(robot: RobotModel, self_collision: bool = True) -> tuple[tupl
         for pair in pairs:
             count[pair] = count.get(pair, 0) + 1
     names = [model.body(i).name for i in range(model.nbody)]
-    excluded = {pair for pair, hits in count.items() if hits > _ALWAYS_TOUCHING * _SAMPLES}
+    often = {pair for pair, hits in count.items() if hits > _OFTEN_TOUCHING * _SAMPLES}
+    links = [robot.link(name) for name in names]
+    excluded = {(a, b) for a, b in often if len(moving_joints(robot, links[a], links[b])) <= 2}
     if not self_collision:
         body = [i for i, name in enumerate(names) if i > 0 and not name.startswith("hand_")]
         hand = [i for i, name in enumerate(names) if name.startswith("hand_")]
@@ -173,7 +152,7 @@ def add_contact_sensors(spec: mujoco.MjSpec, target: str, distractors: Sequence[
 
     Each has `CONTACT_VALUES` values: number of contacts, and net force (N, world frame) on the second-named body.
 
-    - `tip_<finger>`: fingertip link on the target; `finger_<finger>`: whole finger on the target; `palm`: palm on the target.
+    - `tip_<finger>`: fingertip link on the target; `finger_<finger>`: the whole finger on it; `palm`: the palm on it.
     - `robot_target`: all of the robot on the target; `support_target`: the static scene on the target.
     - `robot_support`, `hand_support`: robot (hand included) and hand on the static scene.
     - `robot_distractor_<i>`, `hand_distractor_<i>`: the same on each distractor.

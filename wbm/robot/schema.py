@@ -51,9 +51,7 @@ class ActionSpec:
     """
 
     joint_names: tuple[str, ...] = joints.JOINT_NAMES
-    scale: tuple[float, ...] = field(
-        default_factory=lambda: (0.06,) * 3 + (0.12,) * 7 + (0.3,) * 16 + (0.06,) * 6
-    )
+    scale: tuple[float, ...] = field(default_factory=lambda: (0.06,) * 3 + (0.12,) * 7 + (0.3,) * 16 + (0.06,) * 6)
     limit: float = 3.0
 
     @property
@@ -107,12 +105,42 @@ class PolicySchema:
             Field("depth_xyz", (p, 3), "float32", "m", "base", "points of the depth camera; zeros where not valid"),
             Field("depth_rgb", (p, 3), "uint8", "1", "-", "colour of each depth point, 0 to 255"),
             Field("depth_valid", (p,), "uint8", "1", "-", "1 where the depth point is a return"),
-            Field("depth_target", (p,), "uint8", "1", "-", "1 where a segmenter marks the target; all 0 when there is none"),
+            Field(
+                "depth_target",
+                (p,),
+                "uint8",
+                "1",
+                "-",
+                "1 where a segmenter marks the target; all 0 when there is none",
+            ),
             Field("lidar_xyz", (m, 3), "float32", "m", "base", "points of the LiDAR; zeros where not valid"),
             Field("lidar_valid", (m,), "uint8", "1", "-", "1 where the LiDAR point is a return"),
-            Field("proprio", (NUM_PROPRIO,), "float32", "m, rad, 1/s", "base", "joint state and forward kinematics", PROPRIO_LABELS),
-            Field("prev_action", (self.action.size,), "float32", "1", "-", "the action of the step before", joints.JOINT_NAMES),
-            Field("text", (self.text_dim,), "float32", "1", "-", "sentence embedding of the instruction; zeros when there is none"),
+            Field(
+                "proprio",
+                (NUM_PROPRIO,),
+                "float32",
+                "m, rad, 1/s",
+                "base",
+                "joint state and forward kinematics",
+                PROPRIO_LABELS,
+            ),
+            Field(
+                "prev_action",
+                (self.action.size,),
+                "float32",
+                "1",
+                "-",
+                "the action of the step before",
+                joints.JOINT_NAMES,
+            ),
+            Field(
+                "text",
+                (self.text_dim,),
+                "float32",
+                "1",
+                "-",
+                "sentence embedding of the instruction; zeros when there is none",
+            ),
         )
 
     def field_named(self, name: str) -> Field:
@@ -169,7 +197,9 @@ class PolicySchema:
         action = ActionSpec(
             tuple(data["action"]["joint_names"]), tuple(data["action"]["scale"]), float(data["action"]["limit"])
         )
-        schema = PolicySchema(data["num_depth_points"], data["num_lidar_points"], data["text_dim"], action, data["rate_hz"])
+        schema = PolicySchema(
+            data["num_depth_points"], data["num_lidar_points"], data["text_dim"], action, data["rate_hz"]
+        )
         if [f["name"] for f in data["observation"]] != [f.name for f in schema.observation]:
             raise ValueError("policy schema lists other observation fields than this version")
         return schema

@@ -22,12 +22,13 @@ class SceneBank:
 
     Attributes:
         kind: [K] index into `config.KINDS`; split: [K] str.
-        support_size: [K,8,3] half sizes; support_pos [K,8,3]; support_quat [K,8,4]; support_count [K]; support_rgb [K,3].
-        surface_z: [K] height on which the target rests; ceiling_z [K] height of what is above it (inf where nothing is).
+        support_size: [K,8,3] half sizes; support_pos [K,8,3]; support_quat [K,8,4]; support_count [K];
+            support_rgb [K,3].
+        surface_z: [K] height on which the target rests; ceiling_z [K] height of what is above it (inf: nothing is).
         object: [K,1+D] object index; object_pos [K,1+D,3], object_quat [K,1+D,4] settled poses.
         q_start: [K,32] collision-free start; base_grasp [K,3] base x, y, yaw from which the target is in reach.
         approach: [K] `TOP_DOWN` or `SIDE`, the hint for the pre-grasp.
-        text: [K,2] rows of the instruction table: a training phrasing and a held-out one.
+        text: [K,3] rows of the instruction table: training phrasings; text_held_out [K,1]: phrasings never trained on.
     """
 
     kind: np.ndarray
@@ -46,6 +47,7 @@ class SceneBank:
     base_grasp: np.ndarray
     approach: np.ndarray
     text: np.ndarray
+    text_held_out: np.ndarray
 
     def __len__(self) -> int:
         return len(self.kind)

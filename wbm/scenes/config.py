@@ -84,6 +84,7 @@ class ScenesConfig:
         grasp_reach: distance of the base from the target at the grasp position, m.
         settle_time: simulated time a scene must stay at rest, s.
         settle_tolerance: largest movement in that time, m.
+        encoder: folder of all-MiniLM-L6-v2; empty takes the installed package's.
     """
 
     count: int = 64
@@ -102,6 +103,7 @@ class ScenesConfig:
     grasp_reach: float = 0.65
     settle_time: float = 1.0
     settle_tolerance: float = 0.005
+    encoder: str = ""
 
     def __post_init__(self) -> None:
         unknown = [k for k in self.kinds if k not in KINDS]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import mjbatch
 import mujoco
@@ -10,6 +10,7 @@ import numpy as np
 
 from wbm.robot.model import load_robot
 from wbm.scenes.bank import SceneBank, stack_scenes
+from wbm.scenes.cache import array_digest, code_digest, load_arrays, store_arrays
 from wbm.scenes.config import ScenesConfig
 from wbm.scenes.model import SceneModel, SceneModelConfig
 from wbm.scenes.objects import SPLITS, ObjectSet
@@ -34,7 +35,7 @@ def generate_scenes(
 
     Args:
         model: a scene model to settle in; built when missing.
-        progress: called with a list of rounds to make a bar of it (`stages` passes its own).
+        progress: wraps the list of (split, kind, count) with a progress bar.
 
     Raises:
         ValueError: a kind and split could not be filled, named with the counts.
@@ -42,9 +43,17 @@ def generate_scenes(
     model = model or SceneModel(objects, SceneModelConfig(num_distractors=cfg.num_distractors))
     jobs = [(split, kind, n) for split, n in wanted(cfg, objects).items() for kind in cfg.kinds]
     jobs = [job for job in jobs if job[0] != "val" or (fits(job[1], objects) & (objects.split == "val")).any()]
+    content = array_digest(code_digest(), mujoco.__version__, *(getattr(objects, f.name) for f in fields(ObjectSet)))
     banks = []
     for split, kind, count in progress(jobs) if progress else jobs:
-        banks.append(_fill(model, kind, split, count, cfg, seed))
+        key = array_digest(content, replace(cfg, count=1, test_count=0, encoder=""), seed, split, kind, count)
+        kept = load_arrays("scenes", key)
+        if kept is None:
+            bank = _fill(model, kind, split, count, cfg, seed)
+            store_arrays("scenes", key, **{f.name: getattr(bank, f.name) for f in fields(SceneBank)})
+        else:
+            bank = SceneBank(**kept)
+        banks.append(bank)
     return concatenate(banks)
 
 
@@ -77,7 +86,7 @@ def settle(model: SceneModel, bank: SceneBank, cfg: ScenesConfig) -> SceneBank:
     """Let every scene come to rest, keep those that then stay at rest, with their settled poses and a quiet start."""
     used = bank.object >= 0
     before = bank
-    bank = _replace(bank, *simulate(model, bank, cfg.settle_time)[:2])
+    bank = _with_poses(bank, *simulate(model, bank, cfg.settle_time)[:2])
     shift = np.linalg.norm(bank.object_pos - before.object_pos, axis=2)
     tilt = quat_angle(bank.object_quat, before.object_quat)
     fine = (((shift < MAX_SHIFT) & (tilt < MAX_TILT)) | ~used).all(axis=1)
@@ -91,7 +100,7 @@ def settle(model: SceneModel, bank: SceneBank, cfg: ScenesConfig) -> SceneBank:
 
 
 def simulate(model: SceneModel, bank: SceneBank, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses [K,1+D,3], [K,1+D,4] of the objects after `seconds` with the robot held, and [K] whether the robot touched."""
+    """Poses [K,1+D,3], [K,1+D,4] of the objects after `seconds` with the robot held, and [K] whether it touched."""
     physics = model.model
     options = (physics.opt.timestep, physics.opt.integrator, physics.opt.cone, physics.opt.ls_iterations)
     physics.opt.timestep, physics.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -104,7 +113,7 @@ def simulate(model: SceneModel, bank: SceneBank, seconds: float) -> tuple[np.nda
     ctrl[:] = bank.q_start
     sensors = [batch.sensor(name)[:, 0] for name in model.sensors if name.startswith("robot_")]
     touched = np.zeros(len(bank), dtype=bool)
-    steps = int(round(seconds / STEP))
+    steps = round(seconds / STEP)
     for _ in range(10):
         batch.step(nstep=max(1, steps // 10))
         touched |= np.any([s > 0 for s in sensors], axis=0)
@@ -123,9 +132,10 @@ def concatenate(banks: list[SceneBank]) -> SceneBank:
     return SceneBank(**{f.name: np.concatenate([getattr(b, f.name) for b in banks]) for f in fields(SceneBank)})
 
 
-def _replace(bank: SceneBank, pos: np.ndarray, quat: np.ndarray) -> SceneBank:
-    values = {f.name: getattr(bank, f.name) for f in fields(SceneBank)}
+def _with_poses(bank: SceneBank, pos: np.ndarray, quat: np.ndarray) -> SceneBank:
     absent = (bank.object < 0)[..., None]
-    values["object_pos"] = np.where(absent, bank.object_pos, pos)
-    values["object_quat"] = np.where(absent, bank.object_quat, quat)
-    return SceneBank(**values)
+    return replace(
+        bank,
+        object_pos=np.where(absent, bank.object_pos, pos),
+        object_quat=np.where(absent, bank.object_quat, quat),
+    )

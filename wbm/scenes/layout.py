@@ -1,7 +1,7 @@
 """Tables, shelves and bins as boxes.
 
-All are drawn in the support frame: x points into the support from its front edge, y to the left, z up from the floor; the
-robot stands at negative x.
+All are drawn in the support frame: x points into the support from its front edge, y to the left, z up from the floor;
+the robot stands at negative x.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """One compiled `MjModel` for all scenes: loading a scene writes per-environment model fields and `qpos`.
 
-The template holds the robot, a floor, eight static boxes, a free body `target` and D free bodies `distractor_i`, each with
-eight geometry slots. A slot becomes any primitive or any hull of the object set by writing its fields. Midphase is off,
-because its bounding volumes belong to the compiled geometry and cannot vary.
+The template holds the robot, a floor, eight static boxes, a free body `target` and D free bodies `distractor_i`, each
+with eight geometry slots. A slot becomes any primitive or any hull of the object set by writing its fields. Midphase is
+off, because its bounding volumes belong to the compiled geometry and cannot vary.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Field = Callable[[str], Any]
 
 EVERYTHING = ROBOT_BIT | OBJECT_BIT | STATIC_BIT
 PARK_DEPTH = -3.0
-# The compiler shortens kinematics where a geom's frame is its body's or its inertia's: in the template none may coincide.
+# The compiler shortens kinematics where a geom's frame is its body's or its inertia's: here none may coincide.
 _TILT = (0.9238795325112867, 0.3826834323650898, 0.0, 0.0)
 _LEAN = (0.9238795325112867, 0.0, 0.3826834323650898, 0.0)
 _GEOM_FIELDS = ("geom_type", "geom_dataid", "geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb")
@@ -41,8 +41,8 @@ class SceneModelConfig:
 
     Attributes:
         num_distractors: free bodies besides the target.
-        slots: `native` keeps primitives primitive (fast; geometry types differ between environments). `mesh` makes every
-            slot a mesh, for engines where type and collision bits are the same in all environments.
+        slots: `native` keeps primitives primitive (fast; geometry types differ between environments). `mesh` makes
+            every slot a mesh, for engines where type and collision bits are the same in all environments.
         sections: corners of a circle when a primitive becomes a mesh.
     """
 
@@ -350,8 +350,8 @@ def _add_slot(body: mujoco.MjsBody, **geom: Any) -> None:
 def _body_tables(objects: ObjectSet) -> dict[str, np.ndarray]:
     """Masses and what MuJoCo derives from them for a free body, [O+1,...]; the last row is an absent object.
 
-    With mass m, inertia I about the centre of mass at offset c, and C = [c]x, the free body's mass matrix at the reference
-    pose is [[m 1, -m C], [m C, I - m C C]]; its inverse has the blocks 1/m - C I^-1 C and I^-1.
+    With mass m, inertia I about the centre of mass at offset c, and C = [c]x, the free body's mass matrix at the
+    reference pose is [[m 1, -m C], [m C, I - m C C]]; its inverse has the blocks 1/m - C I^-1 C and I^-1.
     """
     mass = np.append(objects.mass, 0.1)
     inertia = np.concatenate([objects.inertia, [[1e-4] * 3]])

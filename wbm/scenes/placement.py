@@ -9,6 +9,7 @@ from wbm.robot.model import RobotModel
 from wbm.robot.spheres import robot_spheres, self_pairs, sphere_positions
 from wbm.scenes.bank import NUM_SUPPORTS, SIDE, TOP_DOWN, multiply, rotate
 from wbm.scenes.config import KINDS, ScenesConfig
+from wbm.scenes.instructions import NUM_HELD_OUT, NUM_TRAINING
 from wbm.scenes.layout import Layout, draw_layout
 from wbm.scenes.objects import ObjectSet
 
@@ -35,7 +36,7 @@ def fits(kind: str, objects: ObjectSet) -> np.ndarray:
 def draw_scene(
     kind: str, pool: np.ndarray, split: str, objects: ObjectSet, robot: RobotModel, cfg: ScenesConfig, rng
 ) -> dict | None:
-    """One scene as a row for `bank.stack_scenes`, or None when it could not be arranged; `pool` [P] are object indices."""
+    """One scene as a row for `bank.stack_scenes`, or None when it could not be arranged; `pool` [P]: object indices."""
     layout = draw_layout(kind, rng, cfg)
     targets = pool[fits(kind, objects)[pool]]
     if len(targets) == 0:
@@ -73,7 +74,8 @@ def draw_scene(
         q_start=start[0],
         base_grasp=start[1],
         approach=SIDE if kind == "shelf" or (kind == "table" and tall) else TOP_DOWN,
-        text=np.full(2, -1),
+        text=np.full(NUM_TRAINING, -1),
+        text_held_out=np.full(NUM_HELD_OUT, -1),
     )
 
 
@@ -86,7 +88,10 @@ def _support_pose(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 def _place(
     layout: Layout, target: int, pool: np.ndarray, objects: ObjectSet, cfg: ScenesConfig, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Object indices [1+D] (-1 absent) and poses in the support frame; footprints are circles that keep their distance."""
+    """Object indices [1+D] (-1 absent) and poses in the support frame; footprints are circles that keep apart.
+
+    No distractor has the target's noun and colour: every target can be named.
+    """
     slots = 1 + cfg.num_distractors
     chosen = np.full(slots, -1)
     pos, quat = np.zeros((slots, 3)), np.tile((1.0, 0.0, 0.0, 0.0), (slots, 1))
@@ -102,7 +107,8 @@ def _place(
             turn = multiply(np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]), objects.rest_quat[o, rest])
             half = np.abs(_matrix(objects.rest_quat[o, rest])) @ objects.half_extent[o]
             radius = float(np.hypot(half[0], half[1]))
-            if 2 * half[2] > room or o in chosen:
+            twin = slot > 0 and objects.noun[o] == objects.noun[target] and objects.color[o] == objects.color[target]
+            if 2 * half[2] > room or o in chosen or twin:
                 continue
             border = radius + layout.wall_gap
             low, high = layout.low + border, layout.high - border
@@ -134,7 +140,7 @@ def _matrix(quat: np.ndarray) -> np.ndarray:
 def _start(
     robot: RobotModel, pos: np.ndarray, size: np.ndarray, quat: np.ndarray, target: np.ndarray, cfg: ScenesConfig, rng
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """A start configuration [32] clear of supports and of itself, and the base pose [3] from which the target is in reach."""
+    """A start configuration [32] clear of supports and of itself, and the base pose [3] from which to grasp."""
     heading = 2 * np.arctan2(quat[3], quat[0]) + rng.uniform(-0.15, 0.15)
     ahead = np.array([np.cos(heading), np.sin(heading)])
     grasp = np.r_[target[:2] - cfg.grasp_reach * ahead, heading]

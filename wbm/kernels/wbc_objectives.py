@@ -1,0 +1,135 @@
+"""The controller's objectives as rows `J qd = v` with a weight each, one function an objective.
+
+Rows 0-2 are the hand's linear velocity, 3-5 its angular velocity, 6-7 the gaze, 8 the viewing distance. Posture,
+joint-limit centring, base weight, base smoothness and damping act on single joints and are a diagonal.
+"""
+
+# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+import warp as wp
+
+from wbm.kernels import se3
+from wbm.kernels.kinematics import finite_or
+
+wp.set_module_options({"enable_backward": False})
+
+ROWS = 9
+ROW_GAZE = wp.constant(6)
+ROW_DISTANCE = wp.constant(8)
+
+# Columns of the live arrays `weights` and `gains`, one row an environment.
+WEIGHT_NAMES = (
+    "ee_position", "ee_rotation", "gaze", "distance", "posture", "posture_base",
+    "centring", "base", "smoothness", "damping", "collision",
+)  # fmt: skip
+GAIN_NAMES = (
+    "ee_position", "ee_rotation", "gaze", "distance", "posture", "centring", "ee_speed", "ee_turn", "gaze_turn",
+    "distance_min", "distance_max", "safe_obstacle", "safe_self", "gamma", "brake", "escape",
+    "ee_damping", "repulsion",
+)  # fmt: skip
+(
+    W_EE_POSITION, W_EE_ROTATION, W_GAZE, W_DISTANCE, W_POSTURE, W_POSTURE_BASE,
+    W_CENTRING, W_BASE, W_SMOOTHNESS, W_DAMPING, W_COLLISION,
+) = (wp.constant(i) for i in range(len(WEIGHT_NAMES)))  # fmt: skip
+(
+    K_EE_POSITION, K_EE_ROTATION, K_GAZE, K_DISTANCE, K_POSTURE, K_CENTRING, K_EE_SPEED, K_EE_TURN, K_GAZE_TURN,
+    K_DISTANCE_MIN, K_DISTANCE_MAX, K_SAFE_OBSTACLE, K_SAFE_SELF, K_GAMMA, K_BRAKE, K_ESCAPE,
+    K_EE_DAMPING, K_REPULSION,
+) = (wp.constant(i) for i in range(len(GAIN_NAMES)))  # fmt: skip
+
+HUGE = wp.constant(1.0e6)
+POSTURE_SPEED = wp.constant(0.5)
+NEAR_CAMERA = wp.constant(0.05)
+CENTRING_BAND = wp.constant(0.1)
+AZIMUTH_FACTOR_MAX = wp.constant(1.5707964)
+
+
+@wp.func
+def finite3(v: wp.vec3) -> wp.vec3:
+    """`v` with NaN as 0 and everything else within +-1e6."""
+    return wp.vec3(
+        wp.clamp(wp.where(wp.isnan(v[0]), 0.0, v[0]), -HUGE, HUGE),
+        wp.clamp(wp.where(wp.isnan(v[1]), 0.0, v[1]), -HUGE, HUGE),
+        wp.clamp(wp.where(wp.isnan(v[2]), 0.0, v[2]), -HUGE, HUGE),
+    )
+
+
+@wp.func
+def limit_norm(v: wp.vec3, largest: float) -> wp.vec3:
+    """`v`, shortened to the length `largest`."""
+    length = wp.length(v)
+    out = v
+    if length > largest:
+        out = v * (largest / length)
+    return out
+
+
+@wp.func
+def ee_linear_velocity(p_WD: wp.vec3, p_WE: wp.vec3, feed_forward: wp.vec3, gain: float, speed: float) -> wp.vec3:
+    """`v* = sat(k (p_WD - p_WE), speed) + v_ff`, m/s, against the rows `J_WE_W[0:3]`."""
+    return limit_norm(gain * finite3(p_WD - p_WE), speed) + limit_norm(finite3(feed_forward), 2.0 * speed)
+
+
+@wp.func
+def ee_angular_velocity(q_WD: wp.vec4, q_WE: wp.vec4, feed_forward: wp.vec3, gain: float, turn: float) -> wp.vec3:
+    """`omega* = sat(k log(R_WD R_WE^T), turn) + omega_ff`, rad/s, against the rows `J_WE_W[3:6]`."""
+    e = se3.rotation_error(se3.quat_wxyz_normalize(q_WD), q_WE)
+    return limit_norm(gain * e, turn) + limit_norm(finite3(feed_forward), 2.0 * turn)
+
+
+@wp.func
+def gaze_basis(axis: wp.vec3, sight: wp.vec3, fallback: wp.vec3):
+    """Angle `theta` from the optical axis to the line of sight (unit vectors), and the axes of turning.
+
+    `u = axis x sight / |axis x sight|` is the axis that turns the camera onto the target the shortest way and
+    `t = sight x u` completes it. Along and against the optical axis `u` is undefined: `fallback` (unit, across the
+    optical axis) takes its place, so that a camera with the target straight behind it turns too.
+    """
+    cross = wp.cross(axis, sight)
+    h = wp.length(cross)
+    theta = wp.atan2(h, wp.dot(axis, sight))
+    u = fallback
+    if h > 1.0e-5:
+        u = cross / h
+    return theta, u, wp.cross(sight, u)
+
+
+@wp.func
+def gaze_rows(w: wp.vec3, v: wp.vec3, theta: float, u: wp.vec3, t: wp.vec3, distance: float) -> wp.vec2:
+    """One joint's entries of the gaze Jacobian; `w`, `v` the camera's twist for unit velocity of the joint.
+
+    The angle-axis error `e = theta u`, written in the camera frame, changes by `theta_dot = -u.w + t.v/D` along itself
+    and by `(theta / sin theta) (t.w + u.v/D)` across (exact; D the distance to the target). The second row asks
+    for zero. Its factor grows without bound near 180 degrees and is held at its value at 90 degrees there: beyond
+    it the camera may leave the great circle, which costs nothing.
+    """
+    factor = float(1.0)
+    if theta > 0.01:
+        factor = AZIMUTH_FACTOR_MAX
+        if theta < AZIMUTH_FACTOR_MAX:
+            factor = theta / wp.sin(theta)
+    return wp.vec2(
+        wp.dot(t, v) / distance - wp.dot(u, w),
+        factor * (wp.dot(t, w) + wp.dot(u, v) / distance),
+    )
+
+
+@wp.func
+def distance_velocity(distance: float, nearest: float, farthest: float, gain: float) -> float:
+    """`D_dot* = k (clamp(D, nearest, farthest) - D)`, m/s, at most 0.3; zero inside the band. Its row is `-sight.v`."""
+    return wp.clamp(gain * (wp.clamp(distance, nearest, farthest) - distance), -0.3, 0.3)
+
+
+@wp.func
+def posture_velocity(q_posture: float, q: float, gain: float) -> float:
+    """`qd* = sat(k (q_posture - q), 0.5)`, against the joint itself."""
+    return wp.clamp(gain * finite_or(q_posture - q, 0.0), -POSTURE_SPEED, POSTURE_SPEED)
+
+
+@wp.func
+def centring(q: float, q_min: float, q_max: float) -> float:
+    """How far (-1..1) a joint is into the outer tenth of its range, positive when it should move up.
+
+    The objective is `qd* = k c` with the weight `w |c|`: it vanishes with its derivative where the band begins.
+    """
+    band = CENTRING_BAND * (q_max - q_min)
+    return wp.clamp((q_min + band - q) / band, 0.0, 1.0) - wp.clamp((q - q_max + band) / band, 0.0, 1.0)
