@@ -22,14 +22,10 @@ class WholeBodyEnv(GraspEnv):
     In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed in the
     world (a target that followed the base would make the controller chase itself), and the posture is the pre-grasp's. A
     teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves through both phases alike.
-
-    Attributes:
-        started_near: episodes [N] that started at the pre-grasp.
     """
 
-    def __init__(self, *args: Any, q_start: Tensor, **kwargs: Any) -> None:
-        """Arguments as `GraspEnv`; `q_start` [S,32] is each scene's start pose."""
-        self.q_start = q_start
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Arguments as `GraspEnv`."""
         super().__init__(*args, **kwargs)
         n, device = self.num_envs, self.device
         self._near = self.columns.add("near")
@@ -37,7 +33,6 @@ class WholeBodyEnv(GraspEnv):
         self._contact_since = torch.zeros(n, dtype=torch.int64, device=device)
         self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
         self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
-        self.started_near = torch.zeros(n, dtype=torch.bool, device=device)
 
     @property
     def limit_steps(self) -> int:
@@ -50,7 +45,7 @@ class WholeBodyEnv(GraspEnv):
         self._goal_q[ids], self.started_near[ids] = goal, near
         self.phase[ids] = torch.where(near, CONTACT, FREE).to(torch.uint8)
         self._stage[ids], self._contact_since[ids] = 0, 0
-        away = self.q_start[scenes].to(goal)
+        away = self.binding.table.q_start[scenes].to(goal)
         away[:, joints.HAND] = goal[:, joints.HAND]
         return torch.where(near.unsqueeze(1), goal, away)
 
@@ -116,6 +111,7 @@ class WholeBodyEnv(GraspEnv):
         turn = quat_log(quat_mul(quat_conj(term.quat), self._goal_quat))
         turned = quat_mul(term.quat, quat_exp(_towards(torch.zeros_like(turn), turn, c.approach_turn * self.period)))
         keep = (~free).unsqueeze(1)
+        term.velocity.copy_(torch.where(keep, term.velocity, (ahead - term.pos) / self.period))
         term.pos.copy_(torch.where(keep, term.pos, ahead))
         term.quat.copy_(torch.where(keep, term.quat, turned / turned.norm(dim=-1, keepdim=True)))
         hand = self._goal_q[:, joints.HAND].to(term.hand.target)
