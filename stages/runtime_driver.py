@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class RuntimeDriver:
     """Acts in all environments through one runtime each; an episode runner's driver (see `wbm.envs.episodes.Driver`).
 
-    The readings are what a robot would deliver: clouds in the sensors' own frames, stamps on the episode's clock. A refused
-    reading holds the last command, as on a robot.
+    The readings are what a robot would deliver: clouds in the sensors' own frames, stamps on the episode's clock.
+    A refused reading holds the last command, as on a robot.
 
     Args:
         bundle: the policy.

@@ -23,7 +23,7 @@ def world(step: int, q: np.ndarray, previous: np.ndarray) -> dict[str, np.ndarra
     frames = frame_tracks(load_robot(), q)
     pos, quat = (np.stack([frames[n][i] for n in FRAMES], axis=1) for i in (0, 1))
     p, m = SCHEMA.num_depth_points, SCHEMA.num_lidar_points
-    depth, lidar = rng.normal(size=(N, p, 3)) + [1, 0, 0.5], rng.normal(size=(N, m, 3)) + [2, 0, 0]
+    depth, lidar = rng.normal(size=(N, p, 3)) + np.array([1, 0, 0.5]), rng.normal(size=(N, m, 3)) + np.array([2, 0, 0])
     valid = rng.integers(0, 2, (N, p), dtype=np.uint8)
     return {
         "depth_xyz": np.where(valid[..., None] != 0, depth, 0).astype(np.float32),
