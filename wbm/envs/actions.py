@@ -99,7 +99,9 @@ class WbcAction:
     def offset(self, q: Tensor, ee_pos: Tensor, ee_quat: Tensor) -> Tensor:
         """Target pose relative to the hand, in the grasp frame [N,6]: m and rad, scaled to order one."""
         inverse = quat_conj(ee_quat)
-        return torch.cat([20.0 * rotate(inverse, self.pos - ee_pos), 3.0 * quat_log(quat_mul(inverse, self.quat))], dim=-1)
+        return torch.cat(
+            [20.0 * rotate(inverse, self.pos - ee_pos), 3.0 * quat_log(quat_mul(inverse, self.quat))], dim=-1
+        )
 
 
 class JointAction:
@@ -151,4 +153,3 @@ def make_action(
 def _shorten(v: Tensor, limit: float) -> Tensor:
     """Vectors [N,3] no longer than `limit`."""
     return v * (limit / v.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
-

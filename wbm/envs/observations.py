@@ -44,7 +44,9 @@ LABELS: tuple[str, ...] = tuple(label for _, labels, _ in FIELDS for label in la
 class TeacherObservation:
     """Builds observations [N,O]; `labels` names the O entries in order."""
 
-    def __init__(self, robot: RobotModel, offset_labels: tuple[str, ...], action_labels: tuple[str, ...], device: str) -> None:
+    def __init__(
+        self, robot: RobotModel, offset_labels: tuple[str, ...], action_labels: tuple[str, ...], device: str
+    ) -> None:
         self.labels = LABELS + offset_labels + _each("prev_action", action_labels)
         scales = [s for _, labels, s in FIELDS for _ in labels] + [1.0] * (len(self.labels) - len(LABELS))
         self.scale = torch.tensor(scales, device=device)

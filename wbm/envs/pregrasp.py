@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -16,7 +17,7 @@ from wbm.envs.binding import SceneTable
 from wbm.envs.config import EnvConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.randomization import scaled
-from wbm.envs.rotations import quat_exp, quat_log, quat_conj, quat_mul, quat_to_mat, rotate
+from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, quat_to_mat, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
@@ -40,7 +41,6 @@ class StartBank:
     def usable(self) -> Tensor:
         """Indices of the scenes that have a start."""
         return self.count.nonzero().squeeze(1)
-
 
 
 def grasp_poses(table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -88,7 +88,7 @@ def solve_starts(
     device: str = "cpu",
     batch: int = 512,
     iterations: int = 120,
-    rounds: int = 6,
+    rounds: int = 4,
 ) -> StartBank:
     """Find `cfg.starts_per_scene` pre-grasps for each scene by running the controller itself, kinematically.
 
@@ -106,22 +106,25 @@ def solve_starts(
     bank = torch.zeros(count, keep, joints.NUM_JOINTS, device=device)
     found = torch.zeros(count, dtype=torch.int64, device=device)
     solver = _Solver(table, robot, wbc_cfg, batch, device)
-    columns = Columns()
+    columns, tried = Columns(), 0
     jitter, stand = columns.add("jitter", 7), columns.add("stand", 3)
-    for attempt in range(rounds * keep):
-        open_scenes = (found < keep).nonzero().squeeze(1)
-        if len(open_scenes) == 0:
-            break
-        for part in open_scenes.split(batch):
-            keys = part.cpu().numpy() + attempt * count
-            u = torch.from_numpy(episode_uniforms(seed, keys, columns.count)).to(device)
+    for _ in range(rounds):
+        # Every scene that lacks starts gets as many candidates as it lacks, interleaved so that all scenes progress.
+        lacking = torch.cat([(found < keep - k).nonzero().squeeze(1) for k in range(keep)])
+        for first in range(0, len(lacking), batch):
+            part = lacking[first : first + batch]
+            u = torch.from_numpy(episode_uniforms(seed, np.arange(tried, tried + len(part)), columns.count)).to(device)
+            tried += len(part)
             pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter])
             q, good = solver.solve(part, pos, quat, stand_poses(table.base[part], u[:, stand]), iterations)
-            ok = part[good]
-            bank[ok, found[ok]] = q[good]
-            found[ok] += 1
+            for scene, row in zip(part[good].tolist(), q[good], strict=True):
+                if found[scene] < keep:
+                    bank[scene, found[scene]] = row
+                    found[scene] += 1
     if int(found.max()) == 0:
-        raise ValueError(f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff")
+        raise ValueError(
+            f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff"
+        )
     return StartBank(bank, found)
 
 

@@ -21,7 +21,9 @@ class Randomizer:
 
     def __init__(self, cfg: RandomizationConfig, sim: Simulation, binding: SceneBinding, columns: Columns) -> None:
         self.cfg, self.sim, self.binding = cfg, sim, binding
-        self.columns = {name: columns.add(name) for name in ("friction", "mass", "arm_gain", "hand_gain", "contact_time")}
+        self.columns = {
+            name: columns.add(name) for name in ("friction", "mass", "arm_gain", "hand_gain", "contact_time")
+        }
         self._gain = torch.as_tensor(np.asarray(binding.model.actuator_gainprm))
         self._bias = torch.as_tensor(np.asarray(binding.model.actuator_biasprm))
 

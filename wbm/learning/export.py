@@ -38,8 +38,8 @@ class _Exported(nn.Module):
 def export_onnx(policy: StudentPolicy, path: str | Path | None = None) -> bytes:
     """The policy as one self-contained ONNX file.
 
-    Inputs are the schema's fields by name and type, with the batch as their first axis. Outputs are "action" [batch,32],
-    "p_obj_b" [batch,3], and "action_chunk" [batch,k,32] where the student predicts k > 1 actions.
+    Inputs are the schema's fields by name and type, with the batch as their first axis. Outputs are "action"
+    [batch,32], "p_obj_b" [batch,3], and "action_chunk" [batch,k,32] where the student predicts k > 1 actions.
 
     Args:
         policy: what to export.
@@ -91,14 +91,18 @@ def export_onnx(policy: StudentPolicy, path: str | Path | None = None) -> bytes:
 
 
 def check_parity(policy: StudentPolicy, model: bytes, num: int = 32, seed: int = 1) -> float:
-    """Largest difference in any output between torch and ONNX Runtime, over random observations, empty clouds among them."""
+    """Largest difference in any output between torch and ONNX Runtime, over random observations and empty clouds."""
     session = make_session(model)
     names = [o.name for o in session.get_outputs()]
     worst = 0.0
     for size in (1, num):
         obs = random_observation(policy.schema, size, seed)
         expected = policy.predict(obs)
-        expected = {"action": expected["action"][:, 0], "action_chunk": expected["action"], "p_obj_b": expected["p_obj_b"]}
+        expected = {
+            "action": expected["action"][:, 0],
+            "action_chunk": expected["action"],
+            "p_obj_b": expected["p_obj_b"],
+        }
         for name, value in zip(names, session.run(names, obs), strict=True):
             worst = max(worst, float(np.abs(value - expected[name].cpu().numpy()).max()))
     return worst
@@ -115,7 +119,7 @@ def make_session(model: bytes, threads: int = 1):
 
 
 def random_observation(schema: PolicySchema, num: int, seed: int) -> dict[str, np.ndarray]:
-    """Observations [num, ...] of the right types and plausible ranges; the last one has empty clouds, no mask, no text."""
+    """Observations [num, ...] of the right types; the last one has empty clouds, no mask and no instruction."""
     rng = np.random.default_rng(seed)
     obs: dict[str, np.ndarray] = {}
     for item in schema.observation:

@@ -106,7 +106,10 @@ def train_teacher(
 
         # Log
         finished = float(outcomes[RUNNING + 1 :].sum())
-        row = {"reward": rewards_sum / ppo.steps, "success": float(outcomes[1]) / finished if finished else float("nan")}
+        row = {
+            "reward": rewards_sum / ppo.steps,
+            "success": float(outcomes[1]) / finished if finished else float("nan"),
+        }
         row |= {f"term/{name}": float(value) / ppo.steps for name, value in zip(rewards.TERMS, terms, strict=True)}
         row |= {f"outcome/{name}": float(k) for name, k in zip(REASONS[1:], outcomes[1:], strict=True)}
         row |= {f"loss/{name}": value for name, value in losses.items()}
@@ -185,7 +188,14 @@ def make_ppo(env: GraspEnv, ppo: PpoConfig) -> PPO:
 def teacher_spec(env: GraspEnv, cfg: TeacherConfig, ppo: PpoConfig) -> TeacherSpec:
     """The specification that goes beside the weights."""
     return TeacherSpec(
-        cfg.name, cfg.grasp, env.observe.labels, env.action.labels, asdict(env.cfg.action), ppo.hidden, ppo.activation, env.period
+        cfg.name,
+        cfg.grasp,
+        env.observe.labels,
+        env.action.labels,
+        asdict(env.cfg.action),
+        ppo.hidden,
+        ppo.activation,
+        env.period,
     )
 
 

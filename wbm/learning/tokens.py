@@ -127,11 +127,11 @@ class Tokenizer(nn.Module):
         proprio = obs["proprio"]
         ee_pos = proprio[:, _EE_POS : _EE_POS + 3].unsqueeze(1)
         ee_rot = rotation_from_6d(proprio[:, _EE_ROT : _EE_ROT + 6])
-        text = self.text(obs["text"] * self.text_gain)
+        text = self.text(obs["text"] * (self.text_gain if self.cfg.use_text else 0.0))
 
         xyz = obs["depth_xyz"]
         valid = obs["depth_valid"].to(xyz.dtype).unsqueeze(-1)
-        mask = obs["depth_target"].to(xyz.dtype).unsqueeze(-1) * valid
+        mask = obs["depth_target"].to(xyz.dtype).unsqueeze(-1) * valid * float(self.cfg.use_mask)
         rgb = obs["depth_rgb"].to(xyz.dtype) * (2.0 / 255.0) - 1.0
         in_ee = ((xyz - ee_pos) @ ee_rot) * valid
         parts = [(xyz - self.centre_b) * valid, in_ee, rgb * valid, mask]

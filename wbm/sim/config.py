@@ -52,9 +52,13 @@ class SimConfig:
         if self.threads < 0:
             raise ValueError(f"sim.threads must be 0 (all) or more, not {self.threads}")
         if self.engine == "mujoco_warp" and self.integrator == "discrete":
-            raise ValueError("sim.integrator=discrete exists in MuJoCo C only; use implicitfast with engine mujoco_warp")
+            raise ValueError(
+                "sim.integrator=discrete exists in MuJoCo C only; use implicitfast with engine mujoco_warp"
+            )
         if self.integrator != "discrete" and self.ls_iterations < 50:
-            raise ValueError(f"sim.integrator={self.integrator} needs sim.ls_iterations >= 50, not {self.ls_iterations}")
+            raise ValueError(
+                f"sim.integrator={self.integrator} needs sim.ls_iterations >= 50, not {self.ls_iterations}"
+            )
 
     @property
     def period(self) -> float:
