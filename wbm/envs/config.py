@@ -128,7 +128,6 @@ class RandomizationConfig:
         start_tilt: pre-grasp rotation about the grasp frame's x and y, rad.
         start_yaw: pre-grasp rotation about the approach direction, rad.
         start_hand: offset of each hand joint at the start, rad.
-        start_arm: offset of each arm joint at the start of whole-body episodes, rad.
         scene: draw the scene record at random (geometry, pose, support height, clutter); else in order.
     """
 
@@ -141,7 +140,6 @@ class RandomizationConfig:
     start_tilt: Range = field(default_factory=lambda: Range(-0.15, 0.15))
     start_yaw: Range = field(default_factory=lambda: Range(-0.5, 0.5))
     start_hand: Range = field(default_factory=lambda: Range(-0.08, 0.08))
-    start_arm: Range = field(default_factory=lambda: Range(-0.1, 0.1))
     scene: bool = True
 
 
