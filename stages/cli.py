@@ -225,14 +225,14 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:
         sys.stderr.close()
         code = 1
-    except Exception as error:
+    except BaseException as error:
         if "--debug" in arguments:
             raise
         code = _exit_code(error)
     sys.exit(code)
 
 
-def _exit_code(error: Exception) -> int:
+def _exit_code(error: BaseException) -> int:
     kind = type(error).__name__
     if hasattr(error, "exit_code") and hasattr(error, "format_message"):  # a usage error of Typer
         return _complain(error.format_message(), 2)  # pyright: ignore[reportAttributeAccessIssue]

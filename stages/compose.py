@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -94,15 +95,19 @@ def compose(overrides: Sequence[str] = ()) -> Composed:
     Raises:
         ConfigError: one line that names the key and the nearest valid one.
     """
+    return _compose(tuple(overrides))
+
+
+@lru_cache(maxsize=256)
+def _compose(overrides: tuple[str, ...]) -> Composed:
     cfg = _compose_raw(overrides)
     choices = {str(k): str(v) for k, v in cfg.hydra.runtime.choices.items() if not str(k).startswith("hydra/")}
-    return Composed(build(cfg), tuple(overrides), choices)
+    return Composed(build(cfg), overrides, choices)
 
 
 def _compose_raw(overrides: Sequence[str]) -> DictConfig:
-    loader = _start()
     for item in parse(overrides):
-        _check_override(item, loader)
+        _check_override(item)
     try:
         return hydra_compose(CONFIG_NAME, overrides=list(overrides), return_hydra_config=True)
     except Exception as error:  # Hydra raises whatever its parts raise, AssertionError and TypeError among them
@@ -116,14 +121,14 @@ def build(cfg: DictConfig) -> Config:
         ConfigError: as `compose`.
     """
     try:
-        own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+        own = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
         values = cast("dict[str, Any]", OmegaConf.to_container(own, resolve=True, throw_on_missing=True))
     except (OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_one_line(error)) from error
     return convert(Config, values)
 
 
-def _check_override(item: Override, loader: Any) -> None:
+def _check_override(item: Override) -> None:
     key = item.key_or_group
     if item.is_sweep_override():
         raise ConfigError(f"{item.input_line}: several values; add -m to run them all")
@@ -131,11 +136,11 @@ def _check_override(item: Override, loader: Any) -> None:
         raise ConfigError(f"{key}: Hydra's own settings have no effect here; set artifacts.root=DIR for the output")
     if not key:
         raise ConfigError(f"{item.input_line}: names no key; write key=value")
-    if loader.list_groups(parent_name=key) or loader.get_group_options(key):
-        options = loader.get_group_options(key)
+    options = presets(key)
+    if options:
         value = item.value()
         if not isinstance(value, dict) and value not in options and not item.is_delete():
-            raise ConfigError(f"{key}={value}: no such preset{nearest(str(value), options)}")
+            raise ConfigError(f"{key}={value}: no such preset{nearest(str(value), list(options))}")
         return
     hint: Any = Config
     walked: list[str] = []
@@ -148,8 +153,7 @@ def _check_override(item: Override, loader: Any) -> None:
             continue
         known = hints(hint)
         if part not in known:
-            choices = known if walked else [*known, *loader.list_groups("")]
-            words = [".".join([*walked, name]) for name in choices if name not in ("hydra",)]
+            words = [".".join([*walked, name]) for name in (known if walked else [*known, *groups()])]
             raise ConfigError(f"unknown key '{key}'{nearest('.'.join([*walked, part]), words)}")
         hint = known[part]
         walked.append(part)
@@ -181,14 +185,16 @@ def swept_keys(overrides: Sequence[str]) -> list[str]:
     return [item.key_or_group for item in parse(overrides) if item.is_sweep_override()]
 
 
-def presets(group: str) -> list[str]:
+@cache
+def presets(group: str) -> tuple[str, ...]:
     """Names of the presets of a group, empty when there is no such group."""
-    return list(_start().get_group_options(group))
+    return tuple(_start().get_group_options(group))
 
 
-def groups() -> list[str]:
+@cache
+def groups() -> tuple[str, ...]:
     """Names of all groups."""
-    return [name for name in _start().list_groups("") if name != "hydra"]
+    return tuple(name for name in _start().list_groups("") if name != "hydra")
 
 
 def all_keys() -> list[str]:

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from wbm.artifacts.config import ArtifactsConfig
+from wbm.control.config import WbcConfig
 from wbm.deploy.config import DeployConfig
 from wbm.envs.config import EnvConfig
 from wbm.envs.rollout_config import RolloutsConfig
 from wbm.learning.config import PpoConfig, TeacherConfig
 from wbm.learning.student_config import DistillConfig, StudentConfig
 from wbm.report.config import EvaluationConfig
-from wbm.control.config import WbcConfig
 from wbm.robot.config import MjcfOptions
 from wbm.scenes.config import ObjectsConfig, ScenesConfig
 from wbm.sensors.config import SensorsConfig

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from stages.plan import Node, because, look_up
@@ -23,18 +24,22 @@ class StageError(Exception):
     """A stage failed; the message says which, why, and where its output is."""
 
 
-class Interrupted(Exception):
-    """The user or the scheduler asked the run to stop; what is finished is kept."""
+class Interrupted(BaseException):
+    """The user or the scheduler asked the run to stop; what is finished is kept.
+
+    No `Exception`, so that a stage that catches those does not swallow it.
+    """
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a node: `up to date`, `ran`, or `would run`."""
+    """What became of a node: `up to date` or `ran`; `folder` holds the artifact's files."""
 
     node: Node
     state: str
     seconds: float
     manifest: Manifest
+    folder: Path
 
 
 @contextmanager
@@ -91,7 +96,7 @@ def run_node(node: Node, store: Store, progress: Progress, *, force: bool = Fals
     if node.done and not force:
         store.set_latest(node.kind, node.name, node.done.key)
         progress.message(f"{node.stage.name} {node.done.ref}: up to date")
-        return Outcome(node, "up to date", 0.0, node.done)
+        return Outcome(node, "up to date", 0.0, node.done, store.backend.work / node.done.ref)
     missing = [slot for slot, manifest in node.inputs.items() if manifest is None]
     if missing:
         needed = ", ".join(node.upstream[slot].ref for slot in missing)
@@ -104,7 +109,7 @@ def run_node(node: Node, store: Store, progress: Progress, *, force: bool = Fals
         change = _first_change(node.done, artifact.manifest)
         progress.message(f"WARNING {artifact.ref}: the forced run gave other bytes than before: {change}")
     node.done, node.reasons = artifact.manifest, []
-    return Outcome(node, "ran", time.monotonic() - began, artifact.manifest)
+    return Outcome(node, "ran", time.monotonic() - began, artifact.manifest, artifact.path)
 
 
 def _first_change(old: Manifest, new: Manifest) -> str:

@@ -34,7 +34,7 @@ def metrics_text(metrics: dict[str, Any], limit: int = _MAX_METRICS) -> str:
     return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in shown[:limit])
 
 
-def results_table(outcomes: Sequence[Outcome], root: Path | None = None) -> str:
+def results_table(outcomes: Sequence[Outcome]) -> str:
     """Stages with states, times and metrics, then the paths of the report and the bundle."""
     rows = [
         [o.node.stage.name, m.ref, o.state, seconds(m.wall_time_s), metrics_text(m.metrics)]
@@ -43,16 +43,16 @@ def results_table(outcomes: Sequence[Outcome], root: Path | None = None) -> str:
     ]
     text = "\n" + table(["stage", "artifact", "state", "time", "metrics"], rows)
     for outcome in outcomes:
-        folder = (
-            Path(outcome.node.config.artifacts.root) / outcome.manifest.ref
-            if root is None
-            else root / outcome.manifest.ref
-        )
-        if (folder / "report.html").is_file():
-            text += f"report  {folder / 'report.html'}\n"
+        if (outcome.folder / "report.html").is_file():
+            text += f"report  {_short(outcome.folder / 'report.html')}\n"
         if outcome.manifest.kind == "bundle":
-            text += f"bundle  {folder}\n"
+            text += f"bundle  {_short(outcome.folder)}\n"
     return text
+
+
+def _short(path: Path) -> Path:
+    here = Path.cwd()
+    return path.relative_to(here) if here in path.parents else path
 
 
 def sweep_table(rows: Sequence[tuple[Sequence[str], Sequence[Outcome], str | None]]) -> str:

@@ -1,7 +1,7 @@
-"""A synthetic world for the student's tests: coloured blobs on a table; the action points from the grasp frame at the target.
+"""A synthetic world for the student's tests: coloured blobs on a table; actions point from grasp frame to target.
 
-The target is marked by the mask and named by an instruction ("pick up the red thing"), whose embedding is a fixed random vector
-per sentence. Everything that the student must output is a simple function of the target's position.
+The target is marked by the mask and named by an instruction ("pick up the red thing"), whose embedding is a fixed random
+vector per sentence. Everything that the student must output is a simple function of the target's position.
 """
 
 from __future__ import annotations

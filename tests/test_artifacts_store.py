@@ -15,6 +15,8 @@ from wbm.artifacts.errors import ArtifactError, Conflict, Missing
 from wbm.artifacts.lease import acquire
 from wbm.artifacts.store import Store
 
+RACERS = 64 if os.environ.get("WBM_FULL") else 16
+
 
 @pytest.fixture(scope="module")
 def bucket(tmp_path_factory):
@@ -202,7 +204,7 @@ def test_racing_writers_of_one_reference_are_linearizable(store):
 
 
 def test_racing_publishers_of_one_key_give_one_artifact(store):
-    barrier = threading.Barrier(16)
+    barrier = threading.Barrier(RACERS)
 
     def attempt(number):
         barrier.wait()
@@ -213,8 +215,8 @@ def test_racing_publishers_of_one_key_give_one_artifact(store):
         (draft.path / "who").write_text(str(number))
         return draft.publish() and number
 
-    with ThreadPoolExecutor(16) as pool:
-        winners = [n for n in pool.map(attempt, range(16)) if n is not None]
+    with ThreadPoolExecutor(RACERS) as pool:
+        winners = [n for n in pool.map(attempt, range(RACERS)) if n is not None]
     assert len(winners) == 1
     assert (store.resolve("assets/main").path / "who").read_text() == str(winners[0])
     assert store.verify() == []

@@ -236,7 +236,7 @@ def package(tmp_path):
     files = {
         "__init__.py": "",
         "stage.py": "from p.library import solve\n\ndef run():\n    from p import lazy\n    return solve(lazy)\n",
-        "library.py": 'from . import kernel\n\nF = "facts.yaml"\ndef solve(x):\n    """Doc."""\n    return kernel.k(x)\n',
+        "library.py": 'from . import kernel\n\nF = "facts.yaml"\n\ndef solve(x):\n    "Doc."\n    return kernel.k(x)\n',
         "kernel.py": "import numpy\n\ndef k(x):\n    return x + 1\n",
         "lazy.py": 'CLASS = "p.named:Runner"\n',
         "named.py": "class Runner:\n    pass\n",

@@ -25,7 +25,7 @@ from wbm.deploy.loop import measure_latency, run_loop
 from wbm.deploy.runtime import PolicyRuntime
 from wbm.deploy.safety import SafetyFilter, brake_velocity
 from wbm.robot.model import frame_poses, load_robot
-from wbm.robot.schema import PROPRIO_LABELS
+from wbm.robot.schema import PROPRIO_LABELS, to_increment
 
 FAULTS = int(os.environ.get("WBM_FAULTS", "1500"))  # 10000 for the full campaign
 
@@ -80,7 +80,7 @@ def test_action_holds_the_action_before(bundle):
         np.testing.assert_array_equal(runtime.observation["prev_action"], previous)
         expected = forward({k: v[None] for k, v in runtime.observation.items()}, weights())[0]
         np.testing.assert_allclose(command.action, expected, atol=1e-5)
-        previous = command.action
+        previous = to_increment(driver.q, command.q_target, SCHEMA.action).astype(np.float32)
         driver.command(command)
 
 

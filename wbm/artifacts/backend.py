@@ -112,7 +112,7 @@ class LocalBackend:
         self._meta = root / ".store"
 
     def _lock(self, path: str) -> Path:
-        return self._meta / "locks" / digest_bytes(path.encode())[:16]
+        return self._meta / "locks" / digest_bytes(path.encode())[:2]  # 256 locks for any number of records
 
     def read(self, path: str) -> tuple[bytes, str] | None:
         try:
@@ -131,7 +131,9 @@ class LocalBackend:
 
     def delete(self, path: str) -> None:
         with locked(self._lock(path)):
-            (self._meta / path).unlink(missing_ok=True)
+            if (self._meta / path).exists():
+                (self._meta / path).unlink()
+                fsync_path((self._meta / path).parent)
 
     def records(self, prefix: str) -> list[str]:
         base = self._meta / prefix

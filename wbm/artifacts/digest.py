@@ -53,8 +53,8 @@ def plain(value: Any, *, key_only: bool = False) -> Any:
         return value.as_posix()
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    if hasattr(value, "item") and getattr(value, "shape", None) == ():
-        return value.item()
+    if getattr(value, "shape", None) == ():  # a NumPy scalar
+        return value.tolist()  # pyright: ignore[reportAttributeAccessIssue]
     raise TypeError(f"cannot write a {type(value).__name__} into a manifest")
 
 

@@ -136,9 +136,8 @@ class EpisodeReader:
             data = self._zstd.decode(os.pread(fd, int(size), int(offset)))
             return np.frombuffer(data, np.uint8).reshape(self.layout.row_bytes, self._chunk).T
         except (ValueError, RuntimeError) as error:
-            raise ValueError(
-                f"{self._data / str(number) / '0'} is damaged at steps {chunk * self._chunk} and on ({error}); make it again"
-            ) from error
+            file, first = self._data / str(number) / "0", chunk * self._chunk
+            raise ValueError(f"{file} is damaged at steps {first} and on ({error}); make the shard again") from error
 
 
 def shard_paths(folder: str | os.PathLike[str]) -> list[Path]:

@@ -80,6 +80,7 @@ def remove_tree(folder: Path) -> None:
         return
     doomed = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}.doomed")
     os.rename(folder, doomed)
+    fsync_path(folder.parent)  # before the first file goes: a power cut must not bring back half a folder
     shutil.rmtree(doomed)
 
 

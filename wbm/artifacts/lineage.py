@@ -147,4 +147,5 @@ def collect(store: Store, found: Garbage, grace_s: float = GRACE_S) -> None:
             left.discard(ref)
     for folder in found.folders:
         store.drop_folder(folder)
+    store.forget_leases()
     store.backend.sweep(grace_s)

@@ -69,7 +69,7 @@ class ObjectBackend:
     def _unreachable(self, error: Exception) -> ArtifactError:
         return ArtifactError(f"{self.url}: {_first_line(error)}; check the address, AWS_* variables and the network")
 
-    def _list(self, prefix: str) -> list[dict[str, Any]]:
+    def _list(self, prefix: str) -> list[Any]:
         try:
             return [meta for batch in obstore.list(self._store, prefix) for meta in batch]
         except (NotFoundError, FileNotFoundError):

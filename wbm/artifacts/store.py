@@ -284,16 +284,16 @@ class Store:
             if users:
                 raise Conflict(f"{ref}: {users[0]} was made from it; add --force to delete it all the same")
         kind, name, key = ref.split("/")
-        self.backend.remove(ref)
         self.backend.delete(f"pins/{ref}")
         found = self.backend.read(f"refs/{kind}/{name}/latest")
         if found and json.loads(found[0])["key"][:KEY_LENGTH] == key:
-            left = [self.manifest(r) for r in self.names(kind) if r.startswith(f"{kind}/{name}/")]
+            left = [self.manifest(r) for r in self.names(kind) if r.startswith(f"{kind}/{name}/") and r != ref]
             if left:
                 newest = max(left, key=lambda m: m.created)
                 self.set_latest(kind, name, newest.key)
             else:
                 self.backend.delete(f"refs/{kind}/{name}/latest")
+        self.backend.remove(ref)  # after the reference, which must never point to nothing
         return ref
 
     def stale_staging(self, grace_s: float) -> list[Path]:
@@ -306,6 +306,13 @@ class Store:
                 if idle >= grace_s and not (area == ".staging" and is_live(self.backend, f"leases/{ref}")):
                     found.append(path)
         return found
+
+    def forget_leases(self) -> None:
+        """Delete the records of leases that nobody holds and whose attempt left nothing behind."""
+        for path in self.backend.records("leases"):
+            staging = self.backend.work / ".staging" / path.removeprefix("leases/")
+            if not is_live(self.backend, path) and not staging.exists():
+                self.backend.delete(path)
 
     def drop_folder(self, folder: Path) -> None:
         """Delete a staging or quarantine folder."""

@@ -87,8 +87,7 @@ class WbcConfig:
             measured joints do; `measured` starts from the measured joints in every step.
         lead_time: how far the target may run ahead of the measured joint, in seconds at full speed.
         lag: delay of the position actuators, s (kv / kp); `ctrl` leads `q_target` by it.
-        reach: gaps beyond this are not looked at, m.
-        max_rows: dampers that enter one program.
+        reach, reach_self: gaps beyond these are not looked at, to obstacles and to itself, m.
         slack_weight: weight of a damper's slack.
         iterations: largest number of Newton steps.
         distance_floor: floor on d in (4), m, `paper` only.
@@ -99,10 +98,10 @@ class WbcConfig:
     integrate: str = "target"
     lead_time: float = 0.4
     lag: float = 0.1
-    reach: float = 0.2
-    max_rows: int = 16
+    reach: float = 0.25
+    reach_self: float = 0.12
     slack_weight: float = 1.0e5
-    iterations: int = 12
+    iterations: int = 40
     distance_floor: float = 0.01
     weights: WbcWeights = field(default_factory=WbcWeights)
     gains: WbcGains = field(default_factory=WbcGains)
@@ -112,7 +111,7 @@ class WbcConfig:
             raise ValueError(f"wbc.solver: {self.solver!r} is not one of {', '.join(SOLVERS)}")
         if self.integrate not in INTEGRATE:
             raise ValueError(f"wbc.integrate: {self.integrate!r} is not one of {', '.join(INTEGRATE)}")
-        for name in ("dt", "lead_time", "reach", "max_rows", "slack_weight", "iterations", "distance_floor"):
+        for name in ("dt", "lead_time", "reach", "reach_self", "slack_weight", "iterations", "distance_floor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"wbc.{name}: {value} must be positive and finite")

@@ -26,9 +26,7 @@ class Tables:
     ref_body: int
     frame_names: tuple[str, ...]
     frame_mask: dict[str, int]
-    group_mask: np.ndarray
     block: np.ndarray
-    block_mask: np.ndarray
     pair: np.ndarray
 
     def upload(self, device: wp.context.Device) -> Tree:
@@ -65,7 +63,8 @@ def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray) -> Ta
     order = np.argsort(group, kind="stable").astype(np.int32)
     names, starts = np.unique(group[order], return_index=True)
     group_mask = np.array([_mask_of(mask, body[name]) for name in names], dtype=np.int64)
-    block, block_mask, pair = _blocks(np.asarray(pairs), group, names, group_mask, order)
+    block, pair = _blocks(np.asarray(pairs), group, names, order)
+    group_parent, group_own, group_joint = _group_chain(group_mask)
     sphere_body = np.array([body[link] for link in spheres.link[order]], dtype=np.int32)
     if (sphere_body < 0).any():
         raise ValueError("spheres: every sphere must sit on a link that a joint moves")
@@ -87,6 +86,10 @@ def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray) -> Ta
         "sphere_pos": sphere_pos,
         "sphere_radius": np.asarray(spheres.radius, dtype=np.float64)[order],
         "sphere_order": order,
+        "group_mask": group_mask.astype(np.int32),
+        "group_parent": group_parent,
+        "group_own": group_own,
+        "group_joint": group_joint,
         "group_start": np.r_[starts, len(order)].astype(np.int32),
     }
     return Tables(
@@ -94,9 +97,7 @@ def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray) -> Ta
         ref_body=int(body[frames["base"].link]),
         frame_names=tuple(frames),
         frame_mask={name: _mask_of(mask, body[f.link]) for name, f in frames.items()},
-        group_mask=_as_int32(group_mask),
         block=block,
-        block_mask=block_mask,
         pair=pair,
     )
 
@@ -150,27 +151,30 @@ def _mask_of(mask: np.ndarray, body: int) -> int:
     return int(mask[body]) if body >= 0 else 0
 
 
-def _as_int32(bits: np.ndarray) -> np.ndarray:
-    return bits.astype(np.uint32).view(np.int32)
+def _group_chain(group_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each group the earlier group that shares most of its joints, and the joints beside those."""
+    parent, own, joint = [], [0], []
+    for g, bits in enumerate(group_mask.tolist()):
+        inside = [h for h in range(g) if group_mask[h] & ~bits == 0]
+        best = max(inside, key=lambda h: int(group_mask[h]).bit_count(), default=-1)
+        rest = bits & ~(int(group_mask[best]) if best >= 0 else 0)
+        joint += [j for j in range(len(WBC)) if rest >> j & 1]
+        parent.append(best)
+        own.append(len(joint))
+    return tuple(np.array(x, dtype=np.int32) for x in (parent, own, joint))  # type: ignore[return-value]
 
 
-def _blocks(pairs, group, names, group_mask, order):
-    """Pairs sorted into blocks of equal groups, with the bits of the joints that move each side alone."""
+def _blocks(pairs: np.ndarray, group: np.ndarray, names: np.ndarray, order: np.ndarray):
+    """Pairs sorted into blocks of equal groups: group a, group b, first pair, end."""
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     index = {int(name): k for k, name in enumerate(names)}
     rows = sorted((index[int(group[a])], index[int(group[b])], int(rank[a]), int(rank[b])) for a, b in pairs)
-    block, block_mask = [], []
+    block: list[list[int]] = []
     for k, (ga, gb, _, _) in enumerate(rows):
         if block and block[-1][:2] == [ga, gb]:
             block[-1][3] = k + 1
-            continue
-        block.append([ga, gb, k, k + 1])
-        common = int(group_mask[ga]) & int(group_mask[gb])
-        block_mask.append((int(group_mask[ga]) & ~common) | (int(group_mask[gb]) & ~common) << 16)
+        else:
+            block.append([ga, gb, k, k + 1])
     pair = np.array([(a, b) for _, _, a, b in rows], dtype=np.int32).reshape(-1, 2)
-    return (
-        np.array(block, dtype=np.int32).reshape(-1, 4),
-        _as_int32(np.array(block_mask, dtype=np.int64)),
-        pair,
-    )
+    return np.array(block, dtype=np.int32).reshape(-1, 4), pair

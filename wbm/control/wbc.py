@@ -131,12 +131,17 @@ class WholeBodyController:
     def program(self, env: int) -> Program:
         """The quadratic program that the last `step` solved for one environment (for tests and benchmarks)."""
         jac, vel, weight = (a.numpy()[env].astype(np.float64) for a in (self._jac, self._vel, self._weight))
-        rows = int(self._rows.numpy()[env])
+        counts, starts = self._count.numpy()[env], self._region_start.numpy()
+        used = np.concatenate([np.arange(s, s + c) for s, c in zip(starts[:-1], counts, strict=True)]).astype(int)
+        wrench = np.concatenate([a.numpy()[env, used].astype(np.float64) for a in (self._moment, self._force)], axis=1)
+        bits = self._tables.tree["group_mask"][:, None] >> np.arange(len(WBC)) & 1
+        side = self._side.numpy()[env, used]
+        sign = bits[side[:, 0]] - np.where(side[:, 1:] >= 0, bits[side[:, 1]], 0)
         return Program(
             H=jac.T @ (weight[:, None] * jac) + np.diag(self._diag.numpy()[env].astype(np.float64)),
             g=jac.T @ (weight * vel) + self._rhs.numpy()[env].astype(np.float64),
-            A=self._row.numpy()[env, :rows].astype(np.float64),
-            b=self._bound.numpy()[env, :rows].astype(np.float64),
+            A=sign * (wrench @ self._screw.numpy()[env].astype(np.float64).T),
+            b=self._bound.numpy()[env, used].astype(np.float64),
             low=self._low.numpy()[env].copy(),
             high=self._high.numpy()[env].copy(),
             rho=self.cfg.slack_weight,
@@ -154,10 +159,9 @@ class WholeBodyController:
     def _allocate_tables(self) -> None:
         t, robot, cfg = self._tables, self.robot, self.cfg
         self._tree = t.upload(self.device)
-        self._group_mask = self._upload(t.group_mask, wp.int32)
         self._block = self._upload(t.block, wp.vec4i)
-        self._block_mask = self._upload(t.block_mask, wp.int32)
         self._pair = self._upload(t.pair, wp.vec2i)
+        self._num_groups = len(t.tree["group_start"]) - 1
         sizes = np.diff(t.tree["group_start"]) * CANDIDATES_PER_SPHERE
         start = np.r_[0, np.cumsum(np.r_[sizes, SELF_CAPACITY])].astype(np.int32)
         self._region_start = self._upload(start, wp.int32)
@@ -208,7 +212,7 @@ class WholeBodyController:
     def _allocate_state(self) -> None:
         n, joints, rows = self.num_envs, len(WBC), wbc_objectives.ROWS
         bodies, frames, spheres = len(self._tables.tree["body_parent"]), len(self.frame_names), len(self.spheres)
-        groups, c, k = len(self._tables.group_mask), self._num_candidates, self.cfg.max_rows
+        groups, c = self._num_groups, self._num_candidates
         a = self._array
         self.qd, self.q_target, self.ctrl = (a((n, joints), wp.float32) for _ in range(3))
         self.frame_pos, self.frame_quat = a((n, frames), wp.vec3), a((n, frames), wp.vec4)
@@ -222,14 +226,18 @@ class WholeBodyController:
         self._obstacle_ball = a((n, self.num_obstacles), wp.vec4)
         self._count, self._nearest = a((n, groups + 1), wp.int32), a((n, groups + 1), wp.float32)
         self._force, self._moment = a((n, c), wp.vec3), a((n, c), wp.vec3)
-        self._gap, self._mask = a((n, c), wp.float32), a((n, c), wp.int32)
+        self._gap, self._bound, self._side = a((n, c), wp.float32), a((n, c), wp.float32), a((n, c), wp.vec2i)
         self._jac = a((n, rows, joints), wp.float32)
         self._vel, self._weight = a((n, rows), wp.float32), a((n, rows), wp.float32)
         self._diag, self._rhs = a((n, joints), wp.float32), a((n, joints), wp.float32)
         self._q_from, self._qd_from = a((n, joints), wp.float32), a((n, joints), wp.float32)
         self._low, self._high, self._x = (a((n, joints), wp.float64) for _ in range(3))
-        self._row = a((n, k, joints), wp.float32)
-        self._bound, self._spare, self._rows = a((n, k), wp.float32), a((n, k), wp.float32), a((n,), wp.int32)
+        self._twist = a((n, groups), wp.spatial_vectord)
+        self._lack, self._rate = a((n, c), wp.float64), a((n, c), wp.float64)
+        dampers = wbc_qp.Dampers()
+        dampers.region_start, dampers.count, dampers.screw = self._region_start, self._count, self._screw
+        dampers.force, dampers.moment, dampers.bound, dampers.side = self._force, self._moment, self._bound, self._side
+        self._dampers = dampers
 
     def _capture(self, launch) -> wp.Graph:
         launch()  # compiles and loads the kernels, which a capture must not do
@@ -249,10 +257,10 @@ class WholeBodyController:
         )
 
     def _launch_distances(self) -> None:
-        n, m, groups = self.num_envs, self.num_obstacles, len(self._tables.group_mask)
-        tree, reach = self._tree, [self.gains, self.cfg.reach, self._region_start]
-        placed = [self._obstacle_rot, self._obstacle_ball, self.sphere_margin, *reach]
-        found = [self._count, self._nearest, self._force, self._moment, self._gap, self._mask]
+        n, m, groups = self.num_envs, self.num_obstacles, self._num_groups
+        tree, cfg = self._tree, self.cfg
+        placed = [self._obstacle_rot, self._obstacle_ball, self.sphere_margin]
+        found = [self._count, self._nearest, self._force, self._moment, self._gap, self._bound, self._side]
         self._run(
             kinematics.place_spheres,
             n,
@@ -268,13 +276,15 @@ class WholeBodyController:
         self._run(
             distance.obstacle_candidates,
             (n, groups),
-            [tree, self._sphere_pos, self._ball, self._group_mask, self.obstacle_type, self.obstacle_size, *placed],
+            [tree, self._sphere_pos, self._ball, self.obstacle_type, self.obstacle_size, *placed]
+            + [self.gains, cfg.reach, cfg.dt, self._region_start],
             found,
         )
         self._run(
             distance.self_candidates,
             n,
-            [tree, self._sphere_pos, self._ball, self._block, self._block_mask, self._pair, *reach],
+            [tree, self._sphere_pos, self._ball, self._block, self._pair, self.gains, cfg.reach_self, cfg.dt]
+            + [self._region_start],
             found,
         )
 
@@ -308,30 +318,23 @@ class WholeBodyController:
         )
 
     def _launch_qp(self, tasks: list[wp.array]) -> None:
-        problem = [*tasks, self._diag, self._rhs, self._low, self._high, self._rows, self._row, self._bound]
-        found = [self._region_start, self._count, self._nearest, self._force, self._moment, self._gap, self._mask]
-        self._run(
-            wbc_assemble.select_collisions,
-            self.num_envs,
-            [self._limits, self.gains, self._screw, *found, self._low, self._high],
-            [self._row, self._bound, self._spare, self._rows, self.min_distance],
-        )
+        problem = [*tasks, self._diag, self._rhs, self._low, self._high, self._dampers, self._nearest]
         self._run(
             wbc_qp.solve_qp,
             self.num_envs,
-            [*problem, self.cfg.slack_weight, self.cfg.iterations, self._qd_from],
-            [self._x, self.iterations],
+            [self._tree, *problem, self.cfg.slack_weight, self.cfg.iterations, self._qd_from],
+            [self._twist, self._lack, self._rate, self._x, self.iterations, self.min_distance],
         )
 
     def _launch_paper(self, pose: list[wp.array], tasks: list[wp.array]) -> None:
-        found = [self._region_start, self._count, self._nearest, self._force, self._moment, self._gap, self._mask]
+        found = [self._region_start, self._count, self._nearest, self._force, self._moment, self._gap, self._side]
         self._run(
             wbc_paper.paper_tasks, self.num_envs, [self._tree, self._frames, self._targets, self._qd_from, *pose], tasks
         )
         self._run(
             wbc_paper.paper_repulsion,
             self.num_envs,
-            [self._targets, self._screw, *found, self.cfg.reach, self.cfg.distance_floor],
+            [self._tree, self._targets, self._screw, *found, self.cfg.reach, self.cfg.distance_floor],
             [self._diag, self._rhs, self.min_distance],
         )
         self._run(

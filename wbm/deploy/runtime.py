@@ -12,7 +12,7 @@ from wbm.deploy.faults import Fault, Refused
 from wbm.deploy.kinematics import Kinematics
 from wbm.deploy.safety import SafetyFilter
 from wbm.robot import joints
-from wbm.robot.schema import to_target
+from wbm.robot.schema import to_increment, to_target
 
 _HISTORY_S = 1.0
 
@@ -40,6 +40,8 @@ class PolicyRuntime:
         self.observation: dict[str, np.ndarray] = {}
         self.set_instruction(instruction)
         self.reset()
+        # The first run of a network plans its memory: do it here, not in the first step.
+        self._policy({f.name: np.zeros((1, *f.shape), f.dtype) for f in self.contract.schema.observation})
 
     def reset(self) -> None:
         """Start a new episode."""
@@ -53,8 +55,21 @@ class PolicyRuntime:
         Raises:
             Refused: `UNKNOWN_INSTRUCTION`.
         """
-        self._text = self.bundle.instructions.embed(sentence)
+        self.set_embedding(self.bundle.instructions.embed(sentence))
         self.instruction = sentence
+
+    def set_embedding(self, embedding: np.ndarray) -> None:
+        """Choose what to pick up by a sentence embedding [text_dim] of one's own encoder.
+
+        Raises:
+            Refused: `WRONG_SHAPE` or `NOT_FINITE`.
+        """
+        embedding = np.asarray(embedding, dtype=np.float32)
+        if embedding.shape != (self.contract.schema.text_dim,):
+            raise Refused(Fault.WRONG_SHAPE, f"embedding has shape {embedding.shape}, expected ({self.contract.schema.text_dim},)")
+        if not np.isfinite(embedding).all():
+            raise Refused(Fault.NOT_FINITE, "the embedding holds values that are not finite")
+        self._text, self.instruction = embedding, ""
 
     def step(self, reading: Reading, now: float) -> Command:
         """One policy step.
@@ -84,8 +99,9 @@ class PolicyRuntime:
         action = np.clip(action, -spec.limit, spec.limit)
         target, velocity = self.safety.limit(to_target(q, action.astype(np.float64), spec))
         self._check_workspace(target)
-        self._previous = action.astype(np.float32)
-        return Command(now, target, velocity, self._previous)
+        # As in training, the action of the step before is what was commanded, after every limit.
+        self._previous = to_increment(q, target, spec).astype(np.float32)
+        return Command(now, target, velocity, action.astype(np.float32))
 
     def recover(self) -> None:
         """After a refusal, once the driver holds: the next command starts from rest at the measured pose."""

@@ -37,6 +37,7 @@ class GraspEnv:
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
         phase: 0 free space, 1 contact-rich [N].
+        started_near: episodes that started at the pre-grasp [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
     """
 
@@ -76,6 +77,7 @@ class GraspEnv:
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
         self.next_episode = 0
         self.phase = torch.ones(num_envs, dtype=torch.uint8, device=device)
+        self.started_near = torch.ones(num_envs, dtype=torch.bool, device=device)
 
     @property
     def limit_steps(self) -> int:

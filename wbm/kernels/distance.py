@@ -2,16 +2,17 @@
 
 Geometry types are MuJoCo's numbers and half sizes: plane 0, sphere 2, capsule 3, cylinder 5, box 6. All positions are
 relative to a reference point near the robot. A pair that is nearer than the reach becomes a candidate: the unit normal
-`n` (from the obstacle to the sphere), its moment `(p - ref) x n`, the gap to the safety distance and the joints that
-move it. `n^T p_dot = sum_j sigma_j (w_j . moment + m_j . n) qd_j` then needs no Jacobian of the point itself.
+`n` (from the obstacle to the sphere), its moment `(p - ref) x n`, the gap to the safety distance, and the damper's bound
+on the gap's speed. `n^T p_dot = sum_j (w_j . moment + m_j . n) qd_j` then needs no Jacobian of the point itself.
 """
 
-# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3
 from wbm.kernels.kinematics import Tree
-from wbm.kernels.wbc_objectives import K_SAFE_OBSTACLE, K_SAFE_SELF
+from wbm.kernels.wbc_limits import approach_bound
+from wbm.kernels.wbc_objectives import K_BRAKE, K_ESCAPE, K_GAMMA, K_SAFE_OBSTACLE, K_SAFE_SELF
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,6 +22,7 @@ CAPSULE = wp.constant(3)
 CYLINDER = wp.constant(5)
 BOX = wp.constant(6)
 NO_OBSTACLE = wp.constant(-1)
+BASE_BITS = wp.constant(7)  # base x, y, yaw lead the controlled joints
 FAR = wp.constant(1.0e6)
 EPS = wp.constant(1.0e-9)
 
@@ -163,13 +165,18 @@ def _slot(
     return slot
 
 
+@wp.func
+def damper_bound(gains: wp.array2d(dtype=wp.float32), e: int, gap: float, dt: float) -> float:
+    """`approach_bound` with the environment's gains."""
+    return approach_bound(gap, gains[e, K_GAMMA], gains[e, K_BRAKE], gains[e, K_ESCAPE], dt)
+
+
 @wp.kernel(enable_backward=False)
 def obstacle_candidates(
     # in:
     tree: Tree,
     sphere_pos: wp.array2d(dtype=wp.vec3),  # [N,S]
     group_ball: wp.array2d(dtype=wp.vec4),  # [N,G]
-    group_mask: wp.array(dtype=wp.int32),  # [G] controlled joints that move the group, one bit each
     kind: wp.array2d(dtype=wp.int32),  # [N,M]
     size: wp.array2d(dtype=wp.vec3),  # [N,M]
     rot: wp.array2d(dtype=wp.mat33),  # [N,M]
@@ -177,6 +184,7 @@ def obstacle_candidates(
     margin: wp.array2d(dtype=wp.float32),  # [N,S] added to the safety distance, m, in the caller's order
     gains: wp.array2d(dtype=wp.float32),  # [N,K] column K_SAFE_OBSTACLE
     reach: wp.float32,  # gaps above this are ignored, m
+    dt: wp.float32,  # s
     region_start: wp.array(dtype=wp.int32),  # [G+2] where each group's candidates go
     # out:
     count_out: wp.array2d(dtype=wp.int32),  # [N,G+1]
@@ -184,7 +192,8 @@ def obstacle_candidates(
     force_out: wp.array2d(dtype=wp.vec3),  # [N,C] normal
     moment_out: wp.array2d(dtype=wp.vec3),  # [N,C] (p - ref) x normal, m
     gap_out: wp.array2d(dtype=wp.float32),  # [N,C] distance less safety distance, m
-    mask_out: wp.array2d(dtype=wp.int32),  # [N,C] moving joints: low 16 bits with +, high 16 bits with -
+    bound_out: wp.array2d(dtype=wp.float32),  # [N,C] least speed of the gap, m/s
+    side_out: wp.array2d(dtype=wp.vec2i),  # [N,C] group of the sphere; group of the other sphere or -1
 ):
     """Pairs of a group's spheres and the obstacles within reach, a thread an (environment, group)."""
     e, g = wp.tid()
@@ -193,6 +202,7 @@ def obstacle_candidates(
     last = tree.group_start[g + 1]
     start = region_start[g]
     capacity = region_start[g + 1] - start
+    rolls = (tree.group_mask[g] & ~BASE_BITS) == 0  # what only the base moves cannot hit the floor that it rolls on
     count = int(0)
     nearest = FAR
     worst_margin = float(-FAR)
@@ -215,7 +225,9 @@ def obstacle_candidates(
                             hit = distance_local(kind[e, k], size[e, k], wp.transpose(rot_k) * (p - origin))
                             d = hit[3] - tree.sphere_radius[s]
                             gap = d - safe - margin[e, tree.sphere_order[s]]
-                            if margin[e, tree.sphere_order[s]] > -FAR:
+                            if rolls and kind[e, k] == PLANE and wp.abs(rot_k[2, 2]) > 0.99:
+                                gap = FAR
+                            if gap < FAR:
                                 nearest = wp.min(nearest, d)
                             if gap < reach:
                                 slot = _slot(gap_out, e, start, count, capacity, gap)
@@ -224,7 +236,8 @@ def obstacle_candidates(
                                     force_out[e, slot] = n
                                     moment_out[e, slot] = wp.cross(p, n)
                                     gap_out[e, slot] = gap
-                                    mask_out[e, slot] = group_mask[g]
+                                    bound_out[e, slot] = damper_bound(gains, e, gap, dt)
+                                    side_out[e, slot] = wp.vec2i(g, -1)
                                     count = wp.min(count + 1, capacity)
     count_out[e, g] = count
     nearest_out[e, g] = nearest
@@ -237,10 +250,10 @@ def self_candidates(
     sphere_pos: wp.array2d(dtype=wp.vec3),  # [N,S]
     group_ball: wp.array2d(dtype=wp.vec4),  # [N,G]
     block: wp.array(dtype=wp.vec4i),  # [Q] group a, group b, first pair, last pair + 1
-    block_mask: wp.array(dtype=wp.int32),  # [Q] as mask_out
     pair: wp.array(dtype=wp.vec2i),  # [P] sphere a, sphere b
     gains: wp.array2d(dtype=wp.float32),  # [N,K] column K_SAFE_SELF
     reach: wp.float32,
+    dt: wp.float32,
     region_start: wp.array(dtype=wp.int32),  # [G+2]
     # out:
     count_out: wp.array2d(dtype=wp.int32),
@@ -248,7 +261,8 @@ def self_candidates(
     force_out: wp.array2d(dtype=wp.vec3),
     moment_out: wp.array2d(dtype=wp.vec3),
     gap_out: wp.array2d(dtype=wp.float32),
-    mask_out: wp.array2d(dtype=wp.int32),
+    bound_out: wp.array2d(dtype=wp.float32),
+    side_out: wp.array2d(dtype=wp.vec2i),
 ):
     """Self-collision pairs within reach, culled by the groups' balls, a thread an environment."""
     e = wp.tid()
@@ -280,7 +294,8 @@ def self_candidates(
                         force_out[e, slot] = n
                         moment_out[e, slot] = wp.cross(sphere_pos[e, sa], n)
                         gap_out[e, slot] = d - safe
-                        mask_out[e, slot] = block_mask[i]
+                        bound_out[e, slot] = damper_bound(gains, e, d - safe, dt)
+                        side_out[e, slot] = wp.vec2i(block[i][0], block[i][1])
                         count = wp.min(count + 1, capacity)
     count_out[e, region] = count
     nearest_out[e, region] = nearest

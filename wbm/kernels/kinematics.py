@@ -6,7 +6,7 @@ that this holds). Fixed links are folded into offsets. The controlled joints' mo
 point near the robot, which keeps float32 exact to a micrometre wherever the robot stands.
 """
 
-# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3
@@ -33,6 +33,10 @@ class Tree:
     sphere_radius: wp.array(dtype=wp.float32)  # [S] m
     sphere_order: wp.array(dtype=wp.int32)  # [S] the caller's index of a sphere; here they are sorted by group
     group_start: wp.array(dtype=wp.int32)  # [G+1] spheres of group g are group_start[g] .. group_start[g+1]-1
+    group_mask: wp.array(dtype=wp.int32)  # [G] one bit for each controlled joint that moves the group
+    group_parent: wp.array(dtype=wp.int32)  # [G] an earlier group that the others of these joints do not move, or -1
+    group_own: wp.array(dtype=wp.int32)  # [G+1] joints that move g beside those of its parent: group_joint[own[g]..]
+    group_joint: wp.array(dtype=wp.int32)
 
 
 @wp.func

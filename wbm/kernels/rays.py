@@ -312,12 +312,22 @@ def is_leaving(kind: int, o: wp.vec3, size: wp.vec3, axis: wp.vec3, cos_half: fl
     return False
 
 
+@wp.func
+def cones_meet(cone: wp.vec4, cos_other: float, axis_other: wp.vec3) -> bool:
+    """Whether two cones with one apex overlap: the angle between their axes is at most the sum of their half angles."""
+    sines = wp.sqrt(wp.max(1.0 - cone[3] * cone[3], 0.0) * wp.max(1.0 - cos_other * cos_other, 0.0))
+    between = cone[0] * axis_other[0] + cone[1] * axis_other[1] + cone[2] * axis_other[2]
+    return cos_other < 0.0 or between >= cone[3] * cos_other - sines - 1.0e-5
+
+
 @wp.kernel(enable_backward=False)
 def cull_bundles(
     # in:
     env_ids: wp.array[int],  # [n]
     pattern: wp.array[int],  # [N] row of the ray table
     cone: wp.array2d[wp.vec4],  # [Q,G] axis, cosine of the half angle
+    group_cone: wp.array2d[wp.vec4],  # [Q,G'] the same around `group` bundles
+    group: int,
     count: wp.array[int],  # [N]
     slot_cone: wp.array2d[wp.vec4],  # [N,I]
     near: wp.array2d[float],  # [N,I]
@@ -325,36 +335,41 @@ def cull_bundles(
     size: wp.array2d[wp.vec3],
     rot: wp.array2d[wp.mat33],
     origin: wp.array2d[wp.vec3],
+    # scratch:
+    group_scratch: wp.array3d[wp.int16],  # [N,G',I]
     # out:
     cand_count_out: wp.array2d[int],  # [N,G]
     cand_out: wp.array3d[wp.int16],  # [N,G,I] slots, nearest first
 ):
-    """Slots whose bounding sphere touches each bundle's cone and that lie ahead, sorted by their nearest range."""
-    i, g = wp.tid()
+    """Slots whose bounding sphere meets each bundle's cone and that lie ahead, sorted by their nearest range."""
+    i, h = wp.tid()
     env = env_ids[i]
-    c4 = cone[pattern[env], g]
-    axis = wp.vec3(c4[0], c4[1], c4[2])
-    cos_half = c4[3]
-    sin_half = wp.sqrt(wp.max(1.0 - cos_half * cos_half, 0.0))
-    num = int(0)
+    row = pattern[env]
+    whole = group_cone[row, h]
+    axis = wp.vec3(whole[0], whole[1], whole[2])
+    found = int(0)
     for s in range(count[env]):
-        s4 = slot_cone[env, s]
-        # Two cones with one apex meet where the angle between their axes is at most the sum of their half angles.
-        together = cos_half * s4[3] - sin_half * wp.sqrt(wp.max(1.0 - s4[3] * s4[3], 0.0))
-        key = near[env, s]
-        if key <= 0.0 or c4[0] * s4[0] + c4[1] * s4[1] + c4[2] * s4[2] >= together - 1.0e-5 or cos_half < 0.0:
-            local = rot[env, s] * axis
-            leaving = cos_half > 0.0 and is_leaving(
-                kind[env, s], origin[env, s], size[env, s], local, cos_half, sin_half
-            )
-            if not leaving:
-                j = int(num)
-                while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
-                    cand_out[env, g, j] = cand_out[env, g, j - 1]
-                    j -= 1
-                cand_out[env, g, j] = wp.int16(s)
-                num += 1
-    cand_count_out[env, g] = num
+        if near[env, s] <= 0.0 or cones_meet(slot_cone[env, s], whole[3], axis):
+            group_scratch[env, h, found] = wp.int16(s)
+            found += 1
+    for g in range(h * group, wp.min((h + 1) * group, cone.shape[1])):
+        c4 = cone[row, g]
+        axis = wp.vec3(c4[0], c4[1], c4[2])
+        sin_half = wp.sqrt(wp.max(1.0 - c4[3] * c4[3], 0.0))
+        num = int(0)
+        for m in range(found):
+            s = int(group_scratch[env, h, m])
+            key = near[env, s]
+            if key <= 0.0 or cones_meet(slot_cone[env, s], c4[3], axis):
+                ahead = rot[env, s] * axis
+                if c4[3] < 0.0 or not is_leaving(kind[env, s], origin[env, s], size[env, s], ahead, c4[3], sin_half):
+                    j = int(num)
+                    while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
+                        cand_out[env, g, j] = cand_out[env, g, j - 1]
+                        j -= 1
+                    cand_out[env, g, j] = wp.int16(s)
+                    num += 1
+        cand_count_out[env, g] = num
 
 
 @wp.kernel(enable_backward=False)
@@ -377,6 +392,9 @@ def trace_rays(
     near: wp.array2d[float],
     cand_count: wp.array2d[int],  # [N,G]
     cand: wp.array3d[wp.int16],  # [N,G,I]
+    # scratch:
+    best_scratch: wp.array2d[float],  # [N,R] bundle order
+    inst_scratch: wp.array2d[int],  # [N,R]
     # out:
     range_out: wp.array2d[float],  # [N,R] -1 where nothing is hit
     instance_out: wp.array2d[int],  # [N,R] -1 where nothing is hit
@@ -389,9 +407,8 @@ def trace_rays(
     end = wp.min(first + chunk, direction.shape[1])
     g = first // bundle
     for k in range(first, end):
-        out = order[row, k]
-        range_out[env, out] = max_range
-        instance_out[env, out] = -1
+        best_scratch[env, k] = max_range
+        inst_scratch[env, k] = -1
     # An instance's data is loaded once for all rays of the thread; it may stop when all hits lie before the next one.
     farthest = float(max_range)
     for j in range(cand_count[env, g]):
@@ -409,8 +426,7 @@ def trace_rays(
         mesh_id = mesh[env, s]
         farthest = float(0.0)
         for k in range(first, end):
-            out = order[row, k]
-            best = range_out[env, out]
+            best = best_scratch[env, k]
             if start <= best:
                 d = direction[row, k]
                 along = wp.dot(centre, d)
@@ -418,10 +434,14 @@ def trace_rays(
                     t = ray_instance(shape, o, R_IS * d, extent, mesh_id, best)
                     if t < best:
                         best = t
-                        range_out[env, out] = t
-                        instance_out[env, out] = inst
+                        best_scratch[env, k] = t
+                        inst_scratch[env, k] = inst
             farthest = wp.max(farthest, best)
     for k in range(first, end):
         out = order[row, k]
-        if instance_out[env, out] < 0:
+        inst = inst_scratch[env, k]
+        instance_out[env, out] = inst
+        if inst >= 0:
+            range_out[env, out] = best_scratch[env, k]
+        else:
             range_out[env, out] = -1.0

@@ -1,15 +1,15 @@
-"""Writes each environment's quadratic program: task rows, diagonal, box, and collision rows.
+"""Writes each environment's quadratic program: task rows, diagonal and box.
 
 min 1/2 sum_r w_r (J_r qd - v_r)^2 + 1/2 sum_i (h_i qd_i^2 - 2 g_i qd_i) + 1/2 rho sum_k s_k^2
 subject to low <= qd <= high, A_k qd + s_k >= b_k, s_k >= 0
 """
 
-# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import wbc_objectives as obj
 from wbm.kernels.kinematics import Tree, finite_or
-from wbm.kernels.wbc_limits import stoppable_speed, velocity_bounds
+from wbm.kernels.wbc_limits import velocity_bounds
 
 wp.set_module_options({"enable_backward": False})
 
@@ -228,86 +228,3 @@ def bound_velocities(
         qd_from_out[e, j] = previous
         low_out[e, j] = low
         high_out[e, j] = high
-
-
-@wp.func
-def approach_bound(gap: float, gamma: float, brake: float, escape: float, dt: wp.float64) -> float:
-    """Velocity damper `n^T J qd >= b`: `b = -min(gamma gap / dt, v_stop(gap))`, or an escape speed inside the gap.
-
-    `v_stop` is the speed that a deceleration of `brake` (m/s^2) can stop within the gap in discrete time, so that the
-    bound asks for no more than the joints' acceleration limits can give.
-    """
-    step = float(dt)
-    bound = wp.min(-gamma * gap / step, escape)
-    if gap > 0.0:
-        stop = stoppable_speed(wp.float64(gap), wp.float64(wp.max(brake, 1.0e-3)) * dt, dt)
-        bound = wp.max(-gamma * gap / step, -float(stop))
-    return bound
-
-
-@wp.func
-def row_entry(screw: wp.spatial_vector, moment: wp.vec3, force: wp.vec3, mask: int, j: int) -> float:
-    """`dd/dq_j`, the speed of a pair's distance for unit velocity of joint j."""
-    sign = float((mask >> j) & 1) - float((mask >> (16 + j)) & 1)
-    return sign * (wp.dot(wp.spatial_top(screw), moment) + wp.dot(wp.spatial_bottom(screw), force))
-
-
-@wp.kernel(enable_backward=False)
-def select_collisions(
-    # in:
-    limits: Limits,
-    gains: wp.array2d(dtype=wp.float32),
-    screw: wp.array2d(dtype=wp.spatial_vector),  # [N,J]
-    region_start: wp.array(dtype=wp.int32),  # [G+2]
-    count: wp.array2d(dtype=wp.int32),  # [N,G+1]
-    nearest: wp.array2d(dtype=wp.float32),  # [N,G+1]
-    force: wp.array2d(dtype=wp.vec3),  # [N,C]
-    moment: wp.array2d(dtype=wp.vec3),  # [N,C]
-    gap: wp.array2d(dtype=wp.float32),  # [N,C]
-    mask: wp.array2d(dtype=wp.int32),  # [N,C]
-    low: wp.array2d(dtype=wp.float64),  # [N,J]
-    high: wp.array2d(dtype=wp.float64),  # [N,J]
-    # out:
-    row_out: wp.array3d(dtype=wp.float32),  # [N,K,J]
-    bound_out: wp.array2d(dtype=wp.float32),  # [N,K]
-    spare_out: wp.array2d(dtype=wp.float32),  # [N,K]
-    rows_out: wp.array(dtype=wp.int32),  # [N]
-    min_distance_out: wp.array(dtype=wp.float32),  # [N]
-):
-    """Rows of the dampers that this step could break.
-
-    A damper that holds for every velocity in the box cannot act and is dropped, which leaves the program's answer
-    unchanged. Of the rest the K with the least to spare are kept.
-    """
-    e = wp.tid()
-    used = int(0)
-    closest = nearest[e, 0]
-    for g in range(count.shape[1]):
-        closest = wp.min(closest, nearest[e, g])
-        for i in range(region_start[g], region_start[g] + count[e, g]):
-            bound = approach_bound(
-                gap[e, i], gains[e, obj.K_GAMMA], gains[e, obj.K_BRAKE], gains[e, obj.K_ESCAPE], limits.dt
-            )
-            worst = float(0.0)
-            for j in range(screw.shape[1]):
-                a = row_entry(screw[e, j], moment[e, i], force[e, i], mask[e, i], j)
-                worst += wp.min(a * float(low[e, j]), a * float(high[e, j]))
-            spare = worst - bound
-            if spare < 0.0:
-                slot = used
-                if used == row_out.shape[1]:
-                    slot = int(-1)
-                    most = spare
-                    for k in range(used):
-                        if spare_out[e, k] > most:
-                            most = spare_out[e, k]
-                            slot = k
-                else:
-                    used += 1
-                if slot >= 0:
-                    spare_out[e, slot] = spare
-                    bound_out[e, slot] = bound
-                    for j in range(screw.shape[1]):
-                        row_out[e, slot, j] = row_entry(screw[e, j], moment[e, i], force[e, i], mask[e, i], j)
-    rows_out[e] = used
-    min_distance_out[e] = closest

@@ -66,3 +66,19 @@ def velocity_bounds(
         low = wp.min(low, high)
     high = wp.max(high, low)
     return wp.clamp(low, window_low, window_high), wp.clamp(high, window_low, window_high)
+
+
+@wp.func
+def approach_bound(gap: float, gamma: float, brake: float, escape: float, dt: float) -> float:
+    """Velocity damper `n^T J qd >= b`: `b = -min(gamma gap / dt, v_stop(gap))`, or an escape speed inside the gap.
+
+    `v_stop` is the speed that a deceleration of `brake` (m/s^2) can stop within the gap in discrete time (the inverse
+    of S), so that the bound asks for no more than the joints' acceleration limits can give.
+    """
+    bound = wp.min(-gamma * gap / dt, escape)
+    if gap > 0.0:
+        unit = wp.max(brake, 1.0e-3) * dt
+        d = gap / (unit * dt)
+        m = wp.floor((wp.sqrt(1.0 + 8.0 * d) - 1.0) * 0.5)
+        bound = wp.max(-gamma * gap / dt, -unit * (d + 0.5 * m * (m + 1.0)) / (m + 1.0))
+    return bound

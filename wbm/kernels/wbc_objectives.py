@@ -4,7 +4,7 @@ Rows 0-2 are the hand's linear velocity, 3-5 its angular velocity, 6-7 the gaze,
 joint-limit centring, base weight, base smoothness and damping act on single joints and are a diagonal.
 """
 
-# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3

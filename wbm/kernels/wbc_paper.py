@@ -10,13 +10,13 @@ turns the camera towards the target. (4) needs a floor on d to be run at all. Wh
 the velocity and position limits, as a low-level controller would; nothing limits its change.
 """
 
-# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import wbc_objectives as obj
 from wbm.kernels.kinematics import Tree, finite_or
-from wbm.kernels.wbc_assemble import Frames, Limits, Targets, moved, row_entry, se3_axis
-from wbm.kernels.wbc_qp import cholesky_solve, task_hessian, vec16
+from wbm.kernels.wbc_assemble import Frames, Limits, Targets, moved, se3_axis
+from wbm.kernels.wbc_qp import cholesky_solve, damper_entry, task_hessian, task_linear
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,6 +58,7 @@ def paper_tasks(
 @wp.kernel(enable_backward=False)
 def paper_repulsion(
     # in:
+    tree: Tree,
     targets: Targets,
     screw: wp.array2d(dtype=wp.spatial_vector),  # [N,J]
     region_start: wp.array(dtype=wp.int32),  # [G+2]
@@ -66,7 +67,7 @@ def paper_repulsion(
     force: wp.array2d(dtype=wp.vec3),  # [N,C]
     moment: wp.array2d(dtype=wp.vec3),  # [N,C]
     gap: wp.array2d(dtype=wp.float32),  # [N,C]
-    mask: wp.array2d(dtype=wp.int32),  # [N,C]
+    side: wp.array2d(dtype=wp.vec2i),  # [N,C]
     reach: wp.float32,
     floor: wp.float32,
     # in and out:
@@ -91,7 +92,7 @@ def paper_repulsion(
             if d < d_safe:
                 speed = targets.gains[e, obj.K_REPULSION] * (1.0 / d - 1.0 / d_safe) / (d * d)
                 for j in range(screw.shape[1]):
-                    a = row_entry(screw[e, j], moment[e, i], force[e, i], mask[e, i], j)
+                    a = float(damper_entry(tree, screw[e, j], moment[e, i], force[e, i], side[e, i], j))
                     diag_out[e, j] = diag_out[e, j] + weight
                     rhs_out[e, j] = rhs_out[e, j] + weight * speed * a
     min_distance_out[e] = closest
@@ -115,12 +116,7 @@ def solve_paper(
     """(1) by Cholesky, with the clamp's bounds where the other solver has its box."""
     e = wp.tid()
     n = jac.shape[2]
-    linear = vec16()
-    for i in range(n):
-        s = wp.float64(rhs[e, i])
-        for r in range(jac.shape[1]):
-            s += wp.float64(weight[e, r]) * wp.float64(vel[e, r]) * wp.float64(jac[e, r, i])
-        linear[i] = s
+    linear = task_linear(e, n, jac, vel, weight, rhs)
     x = cholesky_solve(task_hessian(e, n, jac, weight, diag), linear, n)
     for i in range(n):
         speed = wp.float64(limits.speed[i])

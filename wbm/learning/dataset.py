@@ -37,6 +37,8 @@ class EpisodeDataset(Dataset):
         chunk: actions a window.
         pregrasp_share: share of a batch from episodes that start at the pre-grasp, when there are any.
         val_share: share of episodes that are held out.
+        data_share: share of the episodes that are used at all.
+        max_noise: episodes with more noise injected than this are left out.
         held_out: take the held-out episodes in place of the others.
         augmentation: what is done to observations; None for nothing but the choice of a phrasing.
 
@@ -55,6 +57,8 @@ class EpisodeDataset(Dataset):
         chunk: int = 1,
         pregrasp_share: float = 0.3,
         val_share: float = 0.0,
+        data_share: float = 1.0,
+        max_noise: float = float("inf"),
         held_out: bool = False,
         augmentation: AugmentConfig | None = None,
     ) -> None:
@@ -64,23 +68,16 @@ class EpisodeDataset(Dataset):
         self.chunk = chunk
         self.augmentation = augmentation
         self._readers = [EpisodeReader(p, schema) for p in paths]
-        table, phrasings = [], []
-        self.num_left_out = 0
-        number = 0
-        for k, reader in enumerate(self._readers):
-            for info in reader.episodes:
-                # every (1 / val_share)-th episode is held out, wherever shard boundaries lie
-                kept_out = int((number + 1) * val_share) > int(number * val_share)
-                number += 1
-                if kept_out != held_out:
-                    self.num_left_out += 1
-                else:
-                    table.append((k, info.first, info.length, info.start == "pregrasp"))
-                    phrasings.append(info.instructions)
-        if not table:
+        infos = [(k, info) for k, r in enumerate(self._readers) for info in r.episodes if info.noise <= max_noise]
+        # a share is every n-th episode, wherever shard boundaries lie
+        infos = [e for i, e in enumerate(infos) if _falls_in(i, data_share)]
+        chosen = [e for i, e in enumerate(infos) if _falls_in(i, val_share) == held_out]
+        if not chosen:
             raise ValueError(f"no {'held-out ' if held_out else ''}episodes in {len(self._readers)} shards")
+        self.num_left_out = len(infos) - len(chosen)
+        table = [(k, info.first, info.length, info.start == "pregrasp") for k, info in chosen]
+        self._phrasings = [info.instructions for _, info in chosen]
         self._episodes = np.asarray(table, np.int64)
-        self._phrasings = phrasings
         self._groups = [np.arange(len(table)), np.flatnonzero(self._episodes[:, 3])]
         self._ends = [np.cumsum(self._episodes[g, 2]) for g in self._groups]
         self._num_pregrasp = round(pregrasp_share * batch_size) if len(self._groups[1]) else 0
@@ -131,7 +128,7 @@ class EpisodeDataset(Dataset):
         )
 
     def statistics(self, num_batches: int = 8) -> dict[str, np.ndarray]:
-        """Mean and standard deviation over random windows of "proprio", "prev_action" and the p_obj_b label, float32."""
+        """Mean and standard deviation over random windows: "proprio_mean", ..., also of "prev_action" and "p_obj_b"."""
         sums: dict[str, list[np.ndarray]] = {"proprio": [], "prev_action": [], "p_obj_b": []}
         for i in range(num_batches):
             rng = rng_of(self.seed, 2**31, i)
@@ -179,6 +176,11 @@ class EpisodeDataset(Dataset):
         batch["action"], batch["action_valid"] = action, valid
         batch["target_label"] = batch["depth_target"] & batch["depth_valid"]
         return batch
+
+
+def _falls_in(number: int, share: float) -> bool:
+    """Whether a number belongs to a share of all, spread evenly."""
+    return int((number + 1) * share) > int(number * share)
 
 
 def to_tensors(batch: dict[str, Any], device: str | torch.device) -> dict[str, torch.Tensor]:

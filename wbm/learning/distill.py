@@ -8,11 +8,12 @@ stopping at a time would make the result depend on the machine's load.
 from __future__ import annotations
 
 import copy
+import json
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,47 +87,106 @@ def distill(
         network.to(cfg.device).train()
         average = copy.deepcopy(network).requires_grad_(False).eval()
         optimizer = torch.optim.AdamW(network.parameters(), lr=cfg.lr, weight_decay=cfg.weight_decay)
-        curve: list[dict[str, float]] = []
-        step = 0
 
         # Continue where an interrupted run stopped
-        checkpoint = Path(scratch) / CHECKPOINT
-        if checkpoint.exists():
-            state = torch.load(checkpoint, map_location=cfg.device, weights_only=True)
-            network.load_state_dict(state["network"])
-            average.load_state_dict(state["average"])
-            optimizer.load_state_dict(state["optimizer"])
-            curve, step = state["curve"], state["step"]
+        run = _Run(network, average, optimizer, Path(scratch) / CHECKPOINT, _fingerprint(student_cfg, cfg))
+        run.load(cfg.device)
 
         # Phase 0 clones; each further phase adds a round of on-policy episodes
         ends = [cfg.iterations + cfg.dagger_iterations * r for r in range(cfg.dagger_rounds + 1)]
         grown = list(paths)
-        for phase, end in enumerate(ends):
-            if phase and collect is not None:
-                grown += collect(StudentPolicy(copy.deepcopy(average), cfg.device), phase)
-                train, val = _datasets(grown, schema, student_cfg, cfg)
-            for batch in train.batches(step, end, cfg.workers):
-                batch = to_tensors(batch, cfg.device)
-                for group in optimizer.param_groups:
-                    group["lr"] = learning_rate(step, cfg)
-                loss, figures = distill_loss(network(batch), batch, cfg)
-                optimizer.zero_grad(set_to_none=True)
-                loss.backward()
-                torch.nn.utils.clip_grad_norm_(network.parameters(), cfg.clip)
-                optimizer.step()
-                _follow(average, network, min(cfg.ema, (1 + step) / (10 + step)))
-                step += 1
+        try:
+            for phase, end in enumerate(ends):
+                if phase and collect is not None:
+                    grown += collect(StudentPolicy(copy.deepcopy(average), cfg.device), phase)
+                    train, val = _datasets(grown, schema, student_cfg, cfg)
+                for batch in train.batches(run.step, end, cfg.workers):
+                    figures = run.advance(to_tensors(batch, cfg.device), cfg)
+                    if run.step % cfg.val_every == 0 or run.step == ends[-1]:
+                        point = {"step": float(run.step), **{f"train_{k}": float(v) for k, v in figures.items()}}
+                        run.curve.append(point | (validate(average, val, cfg) if val is not None else {}))
+                    run.settled = True
+                    if run.step % cfg.checkpoint_every == 0 or run.step == end:
+                        run.save()
+                    if report is not None:
+                        report(run.step, ends[-1], {k: float(figures[k]) for k in ("loss", "p_obj_m")})
+        except BaseException:
+            if run.settled:
+                run.save()  # asked to stop: lose nothing
+            raise
+    return Distilled(average, run.curve, train.num_windows, train.num_episodes)
 
-                if step % cfg.val_every == 0 or step == ends[-1]:
-                    point = {"step": float(step), **{f"train_{k}": float(v) for k, v in figures.items()}}
-                    if val is not None:
-                        point |= validate(average, val, cfg)
-                    curve.append(point)
-                if step % cfg.checkpoint_every == 0 or step == end:
-                    _save_checkpoint(checkpoint, network, average, optimizer, curve, step)
-                if report is not None:
-                    report(step, ends[-1], {"loss": float(figures["loss"]), "p_obj_m": float(figures["p_obj_m"])})
-    return Distilled(average, curve, train.num_windows, train.num_episodes)
+
+@dataclass
+class _Run:
+    """All that changes while training."""
+
+    network: Student
+    average: Student
+    optimizer: torch.optim.Optimizer
+    path: Path
+    fingerprint: str
+    curve: list[dict[str, float]] = field(default_factory=list)
+    step: int = 0
+    settled: bool = False  # whether everything belongs to the same step
+
+    def advance(self, batch: dict[str, torch.Tensor], cfg: DistillConfig) -> dict[str, torch.Tensor]:
+        """One gradient step; the loss's figures."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.step, cfg)
+        loss, figures = distill_loss(self.network(batch), batch, cfg)
+        self.settled = False
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), cfg.clip)
+        self.optimizer.step()
+        with torch.no_grad():
+            decay = min(cfg.ema, (1 + self.step) / (10 + self.step))  # follows closely at first
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1.0 - decay)
+        self.step += 1
+        return figures
+
+    def save(self) -> None:
+        """Replace the checkpoint in one piece."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        partial = self.path.with_suffix(".partial")
+        state = {
+            "fingerprint": self.fingerprint,
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "curve": self.curve,
+            "step": self.step,
+        }
+        with open(partial, "wb") as stream:
+            torch.save(state, stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(partial, self.path)
+
+    def load(self, device: str) -> None:
+        """Take up the checkpoint, if there is one.
+
+        Raises:
+            ValueError: it belongs to another configuration.
+        """
+        if not self.path.exists():
+            return
+        state = torch.load(self.path, map_location=device, weights_only=True)
+        if state["fingerprint"] != self.fingerprint:
+            raise ValueError(
+                f"{self.path} belongs to another student or distill configuration; remove it to start anew"
+            )
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.curve, self.step = state["curve"], state["step"]
+
+
+def _fingerprint(student_cfg: StudentConfig, cfg: DistillConfig) -> str:
+    settings = asdict(cfg)
+    del settings["workers"]
+    return json.dumps([asdict(student_cfg), settings], sort_keys=True)
 
 
 def learning_rate(step: int, cfg: DistillConfig) -> float:
@@ -168,41 +228,18 @@ def _datasets(
         "chunk": student_cfg.chunk,
         "pregrasp_share": cfg.pregrasp_share,
         "val_share": cfg.val_share,
+        "data_share": cfg.data_share,
+        "max_noise": cfg.max_noise,
     }
-    train = EpisodeDataset(paths, schema, seed=cfg.seed, augmentation=cfg.augment, **common)
+    changes = cfg.augment
+    if not student_cfg.use_text:  # the mask is all that tells the target
+        changes = replace(changes, mask_drop=0.0, mask_swap=0.0, text_drop=0.0)
+    if not student_cfg.use_mask:
+        changes = replace(changes, text_drop=0.0)
+    train = EpisodeDataset(paths, schema, seed=cfg.seed, augmentation=changes, **common)
     if not train.num_left_out:
         return train, None
     return train, EpisodeDataset(paths, schema, seed=cfg.seed + 1, held_out=True, **common)
-
-
-@torch.no_grad()
-def _follow(average: Student, network: Student, decay: float) -> None:
-    """average <- decay * average + (1 - decay) * network."""
-    torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), 1.0 - decay)
-
-
-def _save_checkpoint(
-    path: Path,
-    network: Student,
-    average: Student,
-    optimizer: torch.optim.Optimizer,
-    curve: list[dict[str, float]],
-    step: int,
-) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    state = {
-        "network": network.state_dict(),
-        "average": average.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "curve": curve,
-        "step": step,
-    }
-    with open(partial, "wb") as stream:
-        torch.save(state, stream)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(partial, path)
 
 
 @contextmanager

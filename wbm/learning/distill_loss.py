@@ -14,10 +14,11 @@ def distill_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """L = sum_g w_g(d) smooth_l1(pi_g(o) - a_g*) + min(w_p |p - p_obj|^2, cap) + w_m BCE(target mask).
 
-    Equation (8) with smooth L1 (beta `cfg.beta`) in place of the square, over the groups g = base, arm, hand, neck, each
-    the mean over its joints. w is 1 for the base, `cfg.neck_weight` for the neck, and for arm and hand
-    1 + gain * sigmoid((distance - d) / width) with d the distance from grasp frame to object. Where the cap of the position
-    term is reached, the error [m] itself is added: a constant has no gradient, and a head that starts far off never returns.
+    Equation (8) with smooth L1 (beta `cfg.beta`) in place of the square, over the groups g = base, arm, hand, neck,
+    each the mean over its joints. w is 1 for the base, `cfg.neck_weight` for the neck, and for arm and hand
+    1 + gain * sigmoid((distance - d) / width) with d the distance from grasp frame to object. Where the cap of the
+    position term is reached, the error beyond it [m] is added: a constant has no gradient, and a head that starts far
+    off would never return.
 
     Args:
         out: of `Student.forward`.

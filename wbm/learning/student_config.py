@@ -21,6 +21,8 @@ class StudentConfig:
         chunk: actions predicted at once; the first is the one of now.
         local_radius: metres; points nearer than this describe a point's surroundings; 0 leaves them out.
         use_prev_action: whether the action of the step before is an input.
+        use_text: whether the instruction is.
+        use_mask: whether the target mask is.
     """
 
     width: int = 96
@@ -34,6 +36,8 @@ class StudentConfig:
     chunk: int = 1
     local_radius: float = 0.06
     use_prev_action: bool = True
+    use_text: bool = True
+    use_mask: bool = True
 
     def __post_init__(self) -> None:
         for name in (
@@ -54,6 +58,8 @@ class StudentConfig:
             raise ValueError(f"student.lidar_tokens must not be negative, is {self.lidar_tokens}")
         if self.local_radius < 0:
             raise ValueError(f"student.local_radius must not be negative, is {self.local_radius}")
+        if not (self.use_text or self.use_mask):
+            raise ValueError("student.use_text and student.use_mask are both off: nothing tells the student its target")
 
 
 @dataclass(frozen=True)
@@ -125,6 +131,8 @@ class DistillConfig:
         p_obj_weight: weight of the squared error [1/m^2] of the object's position.
         p_obj_cap: largest value of that term.
         mask_weight: weight of the target mask's cross-entropy.
+        data_share: share of the episodes that are used, for ablations.
+        max_noise: episodes with more noise injected than this are left out, for ablations.
         pregrasp_share: share of a batch taken from episodes that start at the pre-grasp, when there are any.
         val_share: share of episodes held out for the validation curve.
         val_every: steps between points of the validation curve.
@@ -156,11 +164,13 @@ class DistillConfig:
     p_obj_weight: float = 100.0
     p_obj_cap: float = 4.0
     mask_weight: float = 0.2
+    data_share: float = 1.0
+    max_noise: float = 1e9
     pregrasp_share: float = 0.3
     val_share: float = 0.05
     val_every: int = 500
     val_batches: int = 4
-    checkpoint_every: int = 250
+    checkpoint_every: int = 100
     threads: int = 2
     workers: int = field(default=0, metadata={"key": False})
     seed: int = 0
@@ -185,10 +195,10 @@ class DistillConfig:
         for name in ("lr", "clip", "beta", "contact_width"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"distill.{name} must be positive, is {getattr(self, name)}")
-        for name in ("pregrasp_share", "val_share", "lr_final", "ema"):
+        for name in ("data_share", "pregrasp_share", "val_share", "lr_final", "ema"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"distill.{name} must lie in [0, 1], is {getattr(self, name)}")
-        for name in ("warmup", "workers", "dagger_rounds", "weight_decay", "p_obj_weight", "mask_weight"):
+        for name in ("warmup", "workers", "dagger_rounds", "max_noise", "weight_decay", "p_obj_weight", "mask_weight"):
             if getattr(self, name) < 0:
                 raise ValueError(f"distill.{name} must not be negative, is {getattr(self, name)}")
         if self.val_share >= 1.0:

@@ -34,7 +34,7 @@ def rotation_from_6d(columns: Tensor) -> Tensor:
 
 def masked_max(features: Tensor, weight: Tensor) -> Tensor:
     """Maximum over points [B,P,C] where weight [B,P,1] is 1; features must not be negative, so that none gives 0."""
-    return (features * weight).amax(dim=1)
+    return (features * weight).max(dim=1).values  # the backward pass of max with indices is far cheaper than amax's
 
 
 def masked_softmax(logits: Tensor, valid: Tensor) -> Tensor:
@@ -56,11 +56,14 @@ def local_shape(xyz: Tensor, rgb: Tensor, valid: Tensor, radius: float) -> Tenso
     """
     scaled = xyz / radius
     square = (scaled * scaled).sum(-1, keepdim=True)
-    d2 = square + square.transpose(1, 2) - 2.0 * scaled @ scaled.transpose(1, 2)
-    weight = torch.relu(1.0 - d2) * valid.transpose(1, 2)  # [B,P,P]
+    one = torch.ones_like(square)
+    # 1 - |a - b|^2 as a single product: a pass over [B,P,P] costs more than the arithmetic in it
+    left = torch.cat([2.0 * scaled, 1.0 - square, -one], dim=-1)
+    right = torch.cat([scaled, one, square], dim=-1)
+    weight = torch.relu(left @ right.transpose(1, 2))
     x, y, z = scaled.unbind(-1)
     moments = torch.stack([x * x, y * y, z * z, x * y, x * z, y * z], dim=-1)
-    sums = weight @ torch.cat([torch.ones_like(valid), scaled, moments, rgb], dim=-1)
+    sums = weight @ (torch.cat([one, scaled, moments, rgb], dim=-1) * valid)
     count = sums[..., :1]
     mean = sums[..., 1:] / (count + 1e-6)
     mx, my, mz = mean[..., :3].unbind(-1)
@@ -106,10 +109,13 @@ class Tokenizer(nn.Module):
         self.text_gain = float(schema.text_dim) ** 0.5
         self.text = nn.Linear(schema.text_dim, width)
         channels = 3 + 3 + 3 + 1 + (_LOCAL_CHANNELS if cfg.local_radius else 0)
-        self.depth = PointEncoder(channels, cfg.point_width, width, text_width=width)
-        self.select = nn.Linear(width, 1 + cfg.attention_tokens)
-        self.pooled = nn.Linear(width, width)
-        self.lidar = PointEncoder(6, cfg.point_width, width * cfg.lidar_tokens) if cfg.lidar_tokens else None
+        self.depth = PointEncoder(channels, cfg.point_width, cfg.point_width, text_width=width)
+        self.select = nn.Linear(cfg.point_width, 1 + cfg.attention_tokens)
+        self.pooled = nn.Linear(cfg.point_width, width)
+        self.attended = nn.Linear(cfg.point_width, width)
+        if cfg.lidar_tokens:
+            self.lidar = PointEncoder(6, cfg.point_width, cfg.point_width)
+            self.scan = nn.Linear(cfg.point_width, width * cfg.lidar_tokens)
         self.target = nn.Sequential(nn.Linear(14, width), nn.ReLU(), nn.Linear(width, width))
         self.proprio = nn.Linear(num_proprio, width * cfg.proprio_tokens)
         self.prev_action = nn.Linear(schema.action.size, width) if cfg.use_prev_action else None
@@ -121,11 +127,11 @@ class Tokenizer(nn.Module):
         proprio = obs["proprio"]
         ee_pos = proprio[:, _EE_POS : _EE_POS + 3].unsqueeze(1)
         ee_rot = rotation_from_6d(proprio[:, _EE_ROT : _EE_ROT + 6])
-        text = self.text(obs["text"] * self.text_gain)
+        text = self.text(obs["text"] * (self.text_gain if self.cfg.use_text else 0.0))
 
         xyz = obs["depth_xyz"]
         valid = obs["depth_valid"].to(xyz.dtype).unsqueeze(-1)
-        mask = obs["depth_target"].to(xyz.dtype).unsqueeze(-1) * valid
+        mask = obs["depth_target"].to(xyz.dtype).unsqueeze(-1) * valid * float(self.cfg.use_mask)
         rgb = obs["depth_rgb"].to(xyz.dtype) * (2.0 / 255.0) - 1.0
         in_ee = ((xyz - ee_pos) @ ee_rot) * valid
         parts = [(xyz - self.centre_b) * valid, in_ee, rgb * valid, mask]
@@ -137,7 +143,7 @@ class Tokenizer(nn.Module):
         attended = weights.transpose(1, 2) @ features
         given = masked_max(features, mask)
         rest = masked_max(features, valid - mask)
-        tokens = [self.pooled(torch.stack([given, rest], dim=1)), self.pooled(attended)]
+        tokens = [self.pooled(torch.stack([given, rest], dim=1)), self.attended(attended)]
 
         selected = (weights[..., :1] * xyz).sum(1)
         any_valid = valid.amax(1)
@@ -151,12 +157,12 @@ class Tokenizer(nn.Module):
         target = torch.cat([*target, has_mask, 10.0 * spread], dim=-1)
         tokens.append(torch.stack([self.target(target), text], dim=1))
 
-        if self.lidar is not None:
+        if self.cfg.lidar_tokens:
             scan = obs["lidar_xyz"]
             scan_valid = obs["lidar_valid"].to(scan.dtype).unsqueeze(-1)
             scan_ee = ((scan - ee_pos) @ ee_rot) * scan_valid
             points = self.lidar(torch.cat([scan * scan_valid, scan_ee], dim=-1))
-            tokens.append(masked_max(points, scan_valid).unflatten(1, (self.cfg.lidar_tokens, -1)))
+            tokens.append(self.scan(masked_max(points, scan_valid)).unflatten(1, (self.cfg.lidar_tokens, -1)))
         state = (proprio - self.proprio_mean) / self.proprio_std
         tokens.append(self.proprio(state).unflatten(1, (self.cfg.proprio_tokens, -1)))
         if self.prev_action is not None:

@@ -1,4 +1,4 @@
-"""Turns a mesh into at most eight convex hulls that stand on their most stable face, cached by content."""
+"""Turns a mesh into at most eight convex hulls that stand on their most stable face; results are cached by content."""
 
 from __future__ import annotations
 
@@ -40,24 +40,29 @@ def cached_import(path: Path, cfg: ObjectsConfig) -> Imported | None:
         kept = load_arrays(_SECTION, _key(path, cfg))
     except OSError as error:
         return Imported([], f"cannot be read ({error.strerror})")
-    return _unpack(kept) if kept is not None else None
+    if kept is None:
+        return None
+    hulls = [kept["vertices"][a:b] for a, b in pairwise(kept["starts"])]
+    return Imported(hulls, str(kept["words"][0]), str(kept["words"][1]))
+
+
+def keep_import(path: Path, cfg: ObjectsConfig, result: Imported) -> None:
+    """Keep a result for later runs, under the content of its file."""
+    vertices = np.concatenate(result.hulls) if result.hulls else np.zeros((0, 3))
+    starts = np.cumsum([0] + [len(h) for h in result.hulls])
+    words = np.array([result.reason, result.rule])
+    store_arrays(_SECTION, _key(path, cfg), vertices=vertices, starts=starts, words=words)
 
 
 def import_mesh(path: Path, cfg: ObjectsConfig) -> Imported:
-    """Read, repair, scale and decompose one file, and keep the result. A file that cannot be used gives a reason."""
-    key = _key(path, cfg)
+    """Read, repair, scale and decompose one file. A file that cannot be used gives the reason."""
     try:
         mesh = read_mesh(path, cfg)
         factor, rule = scale_rule(mesh.extents, cfg.extent)
         mesh.apply_scale(factor)
-        result = Imported(standing(convex_parts(mesh, cfg)), rule=rule)
+        return Imported(standing(convex_parts(mesh, cfg)), rule=rule)
     except MeshError as error:
-        result = Imported([], str(error))
-    starts = np.cumsum([0] + [len(h) for h in result.hulls])
-    vertices = np.concatenate(result.hulls) if result.hulls else np.zeros((0, 3))
-    words = np.array([result.reason, result.rule])
-    store_arrays(_SECTION, key, vertices=vertices, starts=starts, words=words)
-    return result
+        return Imported([], str(error))
 
 
 def _key(path: Path, cfg: ObjectsConfig) -> str:
@@ -70,12 +75,6 @@ def _key(path: Path, cfg: ObjectsConfig) -> str:
     else:
         digest.update(repr((path.stat().st_size, cfg.max_file_mb)).encode())
     return digest.hexdigest()
-
-
-def _unpack(kept: dict[str, np.ndarray]) -> Imported:
-    starts, vertices = kept["starts"], kept["vertices"]
-    hulls = [vertices[a:b] for a, b in pairwise(starts)]
-    return Imported(hulls, str(kept["words"][0]), str(kept["words"][1]))
 
 
 def convex_parts(mesh: trimesh.Trimesh, cfg: ObjectsConfig) -> list[np.ndarray]:
@@ -99,8 +98,8 @@ def convex_parts(mesh: trimesh.Trimesh, cfg: ObjectsConfig) -> list[np.ndarray]:
         max_ch_vertex=cfg.max_hull_vertices,
         decimate=True,
         preprocess_resolution=30,
-        resolution=1000,
-        mcts_iterations=60,
+        resolution=500,
+        mcts_iterations=30,
         mcts_max_depth=2,
         seed=0,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import struct
 from pathlib import Path
 
@@ -34,13 +35,16 @@ def read_mesh(path: Path, cfg: ObjectsConfig) -> trimesh.Trimesh:
         MeshError: the file is empty, too big, malformed, not finite, flat, or open beyond repair.
     """
     check_bounds(path, cfg)
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it prints tracebacks of what is reported here by name
     try:
-        loaded = trimesh.load(path, process=False, skip_materials=True)
+        return repaired(_as_mesh(trimesh.load(path, process=False, skip_materials=True), cfg.max_faces))
+    except MeshError:
+        raise
     except MemoryError:
         raise MeshError("needs more memory than a mesh may take") from None
     except Exception as error:  # parsers fail in as many ways as files are damaged
-        raise MeshError(f"cannot be parsed ({type(error).__name__}: {str(error)[:80]})") from None
-    return repaired(_as_mesh(loaded, cfg.max_faces))
+        text = " ".join(str(error).split())[:80]
+        raise MeshError(f"cannot be parsed ({type(error).__name__}: {text})") from None
 
 
 def check_bounds(path: Path, cfg: ObjectsConfig) -> None:

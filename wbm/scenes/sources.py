@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from wbm.scenes.config import ObjectsConfig
-from wbm.scenes.decompose import Imported, cached_import, import_mesh
+from wbm.scenes.decompose import Imported, cached_import, import_mesh, keep_import
 from wbm.scenes.families import Draft
 from wbm.scenes.isolate import run_isolated
 from wbm.scenes.meshfile import SUFFIXES
@@ -123,8 +123,13 @@ class _Imports:
             yield index
         jobs = [(self._files[index], self._cfg) for index in fresh]
         for number, result, reason in run_isolated(import_mesh, jobs, self._workers, TIMEOUT, MEMORY_MB):
-            self._results[fresh[number]] = result if result is not None else Imported([], reason)
-            yield fresh[number]
+            index = fresh[number]
+            if result is None:  # a crash or a time-out may be the machine's fault: it is not kept
+                self._results[index] = Imported([], reason)
+            else:
+                self._results[index] = result
+                keep_import(self._files[index], self._cfg, result)
+            yield index
 
 
 def choose_held_out(families: list[str], cfg: ObjectsConfig, seed: int) -> tuple[str, ...]:

@@ -24,6 +24,12 @@ def world_rays(sensor: RaySensor, num_envs: int) -> tuple[list[np.ndarray], list
     return [rays[pattern[e]] @ quat_to_mat(quat[e]).T for e in range(num_envs)], list(origins[:num_envs])
 
 
+def cast_all(oracles: list[MujocoScene], rays: list[np.ndarray], origins: list[np.ndarray], exclude_body: int) -> None:
+    """One pass of `mj_multiRay` over all scenes."""
+    for oracle, ray, origin in zip(oracles, rays, origins, strict=True):
+        oracle.cast(origin, ray, exclude_body)
+
+
 def workloads(
     oracles: list[MujocoScene], sensor: RaySensor, meshes: list[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, Callable[[], None]]:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-BUNDLE = 64
+BUNDLE = 32
+GROUP = 8  # bundles that are culled together first
 
 
 @dataclass(frozen=True)
@@ -17,12 +18,14 @@ class RayTable:
         rays: unit directions [Q,R,3] in the order of the outputs.
         order: [Q,R] index of the output ray at each place of the bundle order.
         cone: [Q,G,4] axis and cosine of the half angle of each bundle.
+        group_cone: [Q,ceil(G/GROUP),4] the same around `GROUP` consecutive bundles.
         view: axis [3] and half angle (rad) of a cone that holds all rays of all patterns.
     """
 
     rays: np.ndarray
     order: np.ndarray
     cone: np.ndarray
+    group_cone: np.ndarray
     view: tuple[np.ndarray, float]
 
 
@@ -30,13 +33,19 @@ def build_table(rays: np.ndarray, bundle: int = BUNDLE) -> RayTable:
     """Bundle every pattern of `rays` [Q,R,3] (unit)."""
     rays = np.asarray(rays, np.float64)
     order = np.stack([_split(r, bundle) for r in rays]).astype(np.int32)
-    groups = -(-rays.shape[1] // bundle)
-    cone = np.empty((len(rays), groups, 4))
-    for p, pattern in enumerate(rays):
-        for g in range(groups):
-            axis, half = _cone(pattern[order[p, g * bundle : (g + 1) * bundle]])
-            cone[p, g] = [*axis, np.cos(half)]
-    return RayTable(rays, order, cone, _cone(rays.reshape(-1, 3)))
+    ordered = np.take_along_axis(rays, order[:, :, None].astype(np.int64), axis=1)
+    cones, groups = _cones(ordered, bundle), _cones(ordered, bundle * GROUP)
+    return RayTable(rays, order, cones, groups, _cone(rays.reshape(-1, 3)))
+
+
+def _cones(rays: np.ndarray, size: int) -> np.ndarray:
+    """Axis and cosine of the half angle [Q,ceil(R/size),4] around every `size` consecutive rays [Q,R,3]."""
+    out = np.empty((len(rays), -(-rays.shape[1] // size), 4))
+    for q, pattern in enumerate(rays):
+        for g in range(out.shape[1]):
+            axis, half = _cone(pattern[g * size : (g + 1) * size])
+            out[q, g] = [*axis, np.cos(half)]
+    return out
 
 
 def _cone(rays: np.ndarray) -> tuple[np.ndarray, float]:

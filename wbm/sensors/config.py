@@ -79,7 +79,7 @@ class DepthConfig:
     vfov_deg: float = 58.0
     min_range: float = 0.2
     max_range: float = 3.0
-    bundle: int = 64
+    bundle: int = field(default=32, metadata={"key": False})
     noise: DepthNoise | None = None
     extrinsic: ExtrinsicNoise = field(default_factory=ExtrinsicNoise)
 
@@ -145,7 +145,7 @@ class LidarConfig:
     min_elevation_deg: float = -6.0
     min_range: float = 0.05
     max_range: float = 30.0
-    bundle: int = 64
+    bundle: int = field(default=32, metadata={"key": False})
     noise: LidarNoise | None = None
     extrinsic: ExtrinsicNoise = field(default_factory=ExtrinsicNoise)
 

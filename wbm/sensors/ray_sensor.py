@@ -10,7 +10,7 @@ import warp as wp
 from wbm.kernels.noise import RayNoise, aim_sensors
 from wbm.kernels.points import fill_hits
 from wbm.kernels.rays import cull_bundles, place_instances, trace_rays
-from wbm.sensors.bundles import BUNDLE, RayTable, build_table
+from wbm.sensors.bundles import BUNDLE, GROUP, RayTable, build_table
 from wbm.sensors.config import ExtrinsicNoise
 from wbm.sensors.scene import RayScene
 
@@ -83,6 +83,7 @@ class RaySensor:
         self._sorted = wp.array(in_order.astype(np.float32), dtype=wp.vec3, device=device)
         self._order = wp.array(table.order, dtype=wp.int32, device=device)
         self._cone = wp.array(table.cone.astype(np.float32), dtype=wp.vec4, device=device)
+        self._group_cone = wp.array(table.group_cone.astype(np.float32), dtype=wp.vec4, device=device)
 
     def _allocate(self) -> None:
         n, device = self.num_envs, self.scene.device
@@ -106,6 +107,8 @@ class RaySensor:
         self._rot, self._origin = new(slots, wp.mat33), new(slots, wp.vec3)
         self._sphere, self._slot_cone, self._near = new(slots, wp.vec4), new(slots, wp.vec4), new(slots, wp.float32)
         self._cand_count, self._cand = new(bundles, wp.int32), new((*bundles, slots[1]), wp.int16)
+        self._group = new((n, self._group_cone.shape[1], slots[1]), wp.int16)
+        self._best, self._best_inst = new(hits, wp.float32), new(hits, wp.int32)
         self.true_range, self.true_instance = new(hits, wp.float32), new(hits, wp.int32)
         self.range, self.depth = new(hits, wp.float32), new(hits, wp.float32)
         self.instance, self.id = new(hits, wp.int32), new(hits, wp.int32)
@@ -168,10 +171,10 @@ class RaySensor:
         )  # fmt: skip
         wp.launch(
             cull_bundles,
-            dim=(num, self._cand_count.shape[1]),
+            dim=(num, self._group_cone.shape[1]),
             inputs=[
-                ids, self.pattern, self._cone, self._count, self._slot_cone, self._near, self._kind, self._size,
-                self._rot, self._origin,
+                ids, self.pattern, self._cone, self._group_cone, GROUP, self._count, self._slot_cone, self._near,
+                self._kind, self._size, self._rot, self._origin, self._group,
             ],
             outputs=[self._cand_count, self._cand],
             device=device,
@@ -182,7 +185,7 @@ class RaySensor:
             inputs=[
                 ids, self.pattern, self._sorted, self._order, self.bundle, self._chunk, self.reach, self._inst,
                 self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count,
-                self._cand,
+                self._cand, self._best, self._best_inst,
             ],
             outputs=[self.true_range, self.true_instance],
             device=device,

@@ -1,0 +1,106 @@
+"""Kills runs of a pipeline at random moments and looks at what is left.
+
+`python tests/chaos.py --kills 1000` uses the toy stages; with `--real`, `wbm run profile=smoke` itself (hours).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+ENV = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests")])}
+
+
+@dataclass
+class Damage:
+    """What a storm did."""
+
+    kills: int = 0
+    pipelines: int = 0
+    shards_written: int = 0
+    shards_needed: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+def command(module: str, *arguments: str) -> list[str]:
+    return [sys.executable, "-m", module, *arguments]
+
+
+def digests(module: str, *arguments: str) -> dict[str, str]:
+    """Content digests after an undisturbed run."""
+    done = subprocess.run(command(module, "run", "--json", *arguments), env=ENV, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return {s["artifact"]: s["content_digest"] for s in json.loads(done.stdout)["stages"]}
+
+
+def storm(
+    folder: Path, kills: int, module: str = "toy", longest: float = 1.6, shards: int = 8, seed: int = 0
+) -> Damage:
+    """Run pipelines under one seed after another, killing with SIGKILL at random moments, until `kills` are spent."""
+    rng, damage, number = random.Random(seed), Damage(), 0
+    while damage.kills < kills:
+        number += 1
+        calm = digests(module, f"seed={number}", f"artifacts.root={folder / 'calm'}")
+        log = folder / f"log-{number}"
+        arguments = [f"seed={number}", f"artifacts.root={folder / 'storm'}"]
+        finished = False
+        while not finished and damage.kills < kills:
+            process = subprocess.Popen(
+                command(module, "run", *arguments),
+                env={**ENV, "TOY_LOG": str(log), "TOY_SLEEP": "0.05"},
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                start_new_session=True,
+            )
+            try:
+                _, err = process.communicate(timeout=rng.uniform(0.3, longest))
+                finished = True
+                if process.returncode:
+                    damage.problems.append(err.decode()[-500:])
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.communicate()
+                damage.kills += 1
+            found = subprocess.run(
+                command(module, "artifacts", "verify", arguments[1]), env=ENV, capture_output=True, text=True
+            )
+            if found.returncode:
+                damage.problems.append(found.stdout + found.stderr)
+        if digests(module, *arguments) != calm:
+            damage.problems.append(f"seed {number}: other bytes than an undisturbed run")
+        damage.pipelines += 1
+        if log.exists():
+            damage.shards_written += len(log.read_text().splitlines())
+            damage.shards_needed += shards
+    return damage
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--real", action="store_true")
+    options = parser.parse_args()
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        module, longest = ("stages.cli", 120.0) if options.real else ("toy", 2.5)
+        damage = storm(Path(folder), options.kills, module, longest)
+    redone = damage.shards_written - damage.shards_needed
+    print(f"{damage.kills} kills, {damage.pipelines} pipelines, {time.monotonic() - began:.0f} s")
+    print(f"{redone} shards written twice, {len(damage.problems)} problems")
+    for problem in damage.problems:
+        print(problem)
+    sys.exit(bool(damage.problems))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,27 @@
+"""A small world that the scene tests share: made once in a process."""
+
+from functools import cache
+
+from wbm.scenes.config import ObjectsConfig, ScenesConfig
+from wbm.scenes.generate import generate_scenes
+from wbm.scenes.model import SceneModel, SceneModelConfig
+from wbm.scenes.objects import stack_objects
+from wbm.scenes.procedural import draw_objects
+
+OBJECTS = ObjectsConfig(count=68)
+SCENES = ScenesConfig(count=6, test_count=3)
+
+
+@cache
+def small_objects():
+    return stack_objects(draw_objects(OBJECTS, 1))
+
+
+@cache
+def small_model(slots="native"):
+    return SceneModel(small_objects(), SceneModelConfig(slots=slots))
+
+
+@cache
+def small_bank():
+    return generate_scenes(small_objects(), SCENES, 0, small_model())
