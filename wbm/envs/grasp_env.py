@@ -15,7 +15,7 @@ from wbm.envs.binding import SceneBinding
 from wbm.envs.config import EnvConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.observations import TeacherObservation
-from wbm.envs.outcome import RUNNING, TIMEOUT, UNSTABLE, Outcome
+from wbm.envs.outcome import RUNNING, SUCCESS, UNSTABLE, Outcome
 from wbm.envs.pregrasp import StartBank
 from wbm.envs.randomization import Randomizer
 from wbm.envs.sensing import StateReader
@@ -214,6 +214,9 @@ class GraspEnv:
         if self.cfg.action.term == "joint":
             self.ctrl[:, self._body] = term.target
             return
+        contact = (self.phase == 1).unsqueeze(1)
+        self.margin.copy_(torch.where(contact, self._contact_margin, 0.0))
+        self.base_weight.copy_(torch.where(contact[:, 0], self.cfg.contact_base, self._free_base))
         self.ee_velocity.copy_(term.velocity)
         self.ee_target.copy_(term.pos)
         self.ee_target_quat.copy_(term.quat)
@@ -234,7 +237,7 @@ class GraspEnv:
         code = self.outcome.update(self.state, self.reader.start_pos, time_up)
         done = code != RUNNING
         timed = done & time_up
-        reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed)
+        reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed & (code != SUCCESS))
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
         info |= {"ctrl": self.ctrl.clone(), "ended": self._ended()}
@@ -271,6 +274,11 @@ class GraspEnv:
         self.gaze, self.posture = wp.to_torch(c.gaze_point), wp.to_torch(c.q_posture)
         self.frame_pos, self.frame_quat = wp.to_torch(c.frame_pos), wp.to_torch(c.frame_quat)
         self.min_distance = wp.to_torch(c.min_distance)
+        # In contact the fingers work beside the support, and a base that creeps would meet it.
+        self.margin = wp.to_torch(c.sphere_margin)
+        hand = torch.tensor([n.startswith("hand_") for n in c.spheres.names], device=self.device)
+        self._contact_margin, self._free_base = hand * self.cfg.hand_margin, c.cfg.weights.base
+        self.base_weight = wp.to_torch(c.weights)[:, list(c.weight_names).index("base")]
         self.obstacles = tuple(
             wp.to_torch(a) for a in (c.obstacle_type, c.obstacle_size, c.obstacle_pos, c.obstacle_quat)
         )
