@@ -28,7 +28,9 @@ def scenes() -> tuple[SceneModel, SceneBank]:
     cfg = ObjectsConfig(count=8, families=("box", "can"), held_out=(), test_share=0.0, val_share=0.0)
     objects = stack_objects(draw_objects(cfg, 0))
     model = SceneModel(objects, SceneModelConfig(num_distractors=DISTRACTORS))
-    layout = ScenesConfig(count=4, test_count=0, kinds=("table",), num_distractors=DISTRACTORS, distractors=(0, DISTRACTORS))
+    layout = ScenesConfig(
+        count=4, test_count=0, kinds=("table",), num_distractors=DISTRACTORS, distractors=(0, DISTRACTORS)
+    )
     return model, generate_scenes(objects, layout, 0, model)
 
 

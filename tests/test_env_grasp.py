@@ -43,6 +43,16 @@ def test_an_episode_does_not_depend_on_its_environment() -> None:
     assert not torch.allclose(make(2, seed=1).reset(4)[0], first[0], atol=1e-2)
 
 
+def test_the_previous_action_is_observed_in_every_step() -> None:
+    env = make(3)
+    env.reset()
+    start = len(env.observe.labels) - env.num_actions
+    for _ in range(4):
+        action = 0.9 * torch.rand(3, env.num_actions)
+        obs, _, done, _ = env.step(action)
+        assert torch.equal(obs[~done, start:], action[~done])
+
+
 def test_restored_environment_continues_bit_for_bit() -> None:
     torch.manual_seed(0)
     cfg = replace(EnvConfig(), episode_s=1.2)  # episodes end on the way
@@ -52,6 +62,7 @@ def test_restored_environment_continues_bit_for_bit() -> None:
     for action in actions[:25]:
         env.step(action)
     other.load_state_dict(env.state_dict())
+    assert torch.equal(other.obs, env.obs)
     for action in actions[25:]:
         a, b = env.step(action), other.step(action)
         for left, right in zip(a[:3], b[:3], strict=True):
@@ -165,7 +176,13 @@ def test_scripted_grasp_lifts_some_objects() -> None:
 
 
 def test_settings_are_checked() -> None:
-    for bad in ({"start": "far"}, {"episode_s": 0.5}, {"starts_per_scene": 0}, {"pregrasp_share": 2.0}, {"finish_s": 0.2}):
+    for bad in (
+        {"start": "far"},
+        {"episode_s": 0.5},
+        {"starts_per_scene": 0},
+        {"pregrasp_share": 2.0},
+        {"finish_s": 0.2},
+    ):
         with pytest.raises(ValueError, match=r"^env\."):
             EnvConfig(**bad)
     with pytest.raises(ValueError, match=r"env\.action\.term"):

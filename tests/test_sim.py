@@ -73,6 +73,7 @@ def test_restored_state_continues_bit_for_bit() -> None:
     sim.step(23)
     first = sim.save_state()
     other = make_simulation(model(), 2, TRAIN)
+    other.qpos[:] = 0.7  # a write that waits must not survive
     other.load_state(saved)
     assert torch.equal(other.ctrl, sim.ctrl)
     other.step(23)

@@ -152,7 +152,9 @@ class GraspEnv:
         hand = self.cfg.randomization.start_hand
         if hand.on:
             q[:, joints.HAND] += hand.low + (hand.high - hand.low) * u[:, self._hand]
-            q[:, joints.HAND] = torch.maximum(torch.minimum(q[:, joints.HAND], self.action.hand.high), self.action.hand.low)
+            q[:, joints.HAND] = torch.maximum(
+                torch.minimum(q[:, joints.HAND], self.action.hand.high), self.action.hand.low
+            )
         self.episode[ids] = torch.from_numpy(episodes).to(self.device)
         self.scene[ids], self.elapsed[ids] = scenes, 0
         self._load_physics(ids, u, scenes)
@@ -230,9 +232,10 @@ class GraspEnv:
         self.sim.ctrl.copy_(self.ctrl if self.noise is None else self.ctrl + self.noise)
         self.sim.step(self.decimation)
         self.elapsed += 1
-        self._refresh()
-        reward, terms = rewards.total(self.state, action, self.previous, self.cfg.reward)
+        before = self.previous.clone()
         self.previous.copy_(action)
+        self._refresh()
+        reward, terms = rewards.total(self.state, action, before, self.cfg.reward)
         time_up = self._time_up()
         code = self.outcome.update(self.state, self.reader.start_pos, time_up)
         done = code != RUNNING

@@ -64,7 +64,7 @@ def train_teacher(
     Args:
         env: training environments.
         eval_env: environments of the periodic deterministic evaluation.
-        directory: receives `policy.safetensors`, `policy.json`, `curve.npz`, `curve.png` and TensorBoard's `logs`.
+        directory: receives `policy.safetensors`, `policy.json`, `curve.json`, `curve.png` and TensorBoard's `logs`.
         scratch: holds the checkpoint and the newest policy.
         seed: of network and exploration; the environments have their own.
         report: called after each iteration.
@@ -119,7 +119,7 @@ def train_teacher(
         row |= {f"term/{name}": float(value) / ppo.steps for name, value in zip(rewards.TERMS, terms, strict=True)}
         row |= {f"outcome/{name}": float(k) for name, k in zip(REASONS[1:], outcomes[1:], strict=True)}
         row |= {f"loss/{name}": value for name, value in losses.items()}
-        row |= {"lr": alg.learning_rate, "std": float(alg.actor.output_std.mean())}
+        row |= {"lr": alg.learning_rate, "std": float(alg.actor.output_std.detach().mean())}
 
         # Evaluate, keep the best
         last = iteration + 1 == cfg.iterations
