@@ -1,4 +1,4 @@
-"""The environment: episodes belong to their number, state can be restored, ablations change what they say and no more."""
+"""The environment: episodes belong to their number, state can be restored, ablations change what they say only that."""
 
 from __future__ import annotations
 

@@ -28,8 +28,9 @@ def state(n: int = 1, **values) -> GraspState:
 
 def test_eight_terms_sum_up_with_their_weights() -> None:
     torch.manual_seed(0)
-    s = state(5, **{name: torch.rand(5, 4) for name in PER_FINGER}, height=torch.rand(5) * 0.2, opposition=torch.rand(5),
-              held=torch.ones(5), lifted=torch.ones(5), obstacle_force=torch.rand(5) * 30, forbidden=torch.ones(5))  # fmt: skip
+    flags = dict(held=torch.ones(5), lifted=torch.ones(5), forbidden=torch.ones(5))
+    amounts = dict(height=torch.rand(5) * 0.2, opposition=torch.rand(5), obstacle_force=torch.rand(5) * 30)
+    s = state(5, **{name: torch.rand(5, 4) for name in PER_FINGER}, **flags, **amounts)
     action, previous = torch.rand(5, 27), torch.rand(5, 27)
     value, parts = rewards.total(s, action, previous, CFG)
     assert parts.shape == (5, 8) and len(rewards.TERMS) == 8
@@ -110,7 +111,8 @@ def test_box_gap_finds_the_nearest_point(seed: int) -> None:
 
 
 def test_segment_gap_and_opposition() -> None:
-    point, ends = torch.tensor([[0.0, 1.0, 0.0]] * 3), torch.tensor([[[-1.0, 0, 0], [1, 0, 0]], [[1.0, 0, 0], [3, 0, 0]], [[0.0] * 3] * 2])  # fmt: skip
+    point = torch.tensor([[0.0, 1.0, 0.0]] * 3)
+    ends = torch.tensor([[[-1.0, 0, 0], [1, 0, 0]], [[1.0, 0, 0], [3, 0, 0]], [[0.0] * 3] * 2])
     np.testing.assert_allclose(segment_gap(point, ends[:, 0], ends[:, 1]).numpy(), [1, np.sqrt(2), 1], rtol=1e-6)
     force = torch.zeros(4, 4, 3)
     force[0, 0], force[0, 3] = torch.tensor([5.0, 0, 0]), torch.tensor([-2.0, 0, 0])

@@ -17,9 +17,11 @@ XML = """
 <mujoco><option gravity="0 0 -9.81"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
 <body name="slider" pos="0 0 0.5"><joint name="s" type="slide" axis="1 0 0" damping="0.5"/>
  <geom name="rod" type="capsule" size="0.02 0.1" mass="0.3"/></body>
-<body name="cube" pos="0 0 0.15"><freejoint name="free"/><geom name="cube" type="box" size="0.05 0.04 0.03" mass="0.2"/></body>
+<body name="cube" pos="0 0 0.15"><freejoint name="free"/>
+ <geom name="cube" type="box" size="0.05 0.04 0.03" mass="0.2"/></body>
 </worldbody><actuator><position name="a" joint="s" kp="20" kv="2"/></actuator>
-<sensor><contact name="touch" body1="cube" body2="world" data="found force" reduce="netforce" num="1"/></sensor></mujoco>
+<sensor><contact name="touch" body1="cube" body2="world" data="found force" reduce="netforce" num="1"/></sensor>
+</mujoco>
 """
 
 

@@ -167,6 +167,7 @@ class GraspEnv:
         self._obstacles(ids, scenes)
         self.posture[ids] = q[:, self._body]
         self.controller.reset(ids)
+        self.min_distance[ids] = 1.0  # the last episode's must not be observed
         self.outcome.reset(ids)
         self.previous[ids] = 0.0
         self.q_in.copy_(self.sim.qpos[:, : joints.NUM_JOINTS])
