@@ -1,5 +1,8 @@
 """Golden vectors and parity of an export, from the evaluation's recorded episodes where it has any."""
 
+# torch types registered buffers as Tensor | Module.
+# pyright: reportCallIssue=false
+
 from __future__ import annotations
 
 from pathlib import Path

@@ -61,8 +61,10 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
     blocks.mkdir(parents=True, exist_ok=True)
     jobs = [
         BlockJob(
-            first, min(BLOCK, e.episodes - first), blocks, inputs["assets"].path, policy.path, policy.manifest.kind, world,
-            cfg.sensors, e.split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes, cfg.seed + e.seed,
+            first, min(BLOCK, e.episodes - first), blocks, inputs["assets"].path, policy.path,
+            policy.manifest.kind, world,
+            cfg.sensors, e.split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
+            cfg.seed + e.seed,
         )
         for first in range(0, e.episodes, BLOCK)
     ]  # fmt: skip

@@ -58,7 +58,8 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
             shown = p.iteration
             if p.iteration % teacher.eval_every == 0:
                 progress.message(
-                    f"  iteration {p.iteration}/{p.iterations}: success {p.success:.2f}, deterministic {p.evaluation:.2f}, "
+                    f"  iteration {p.iteration}/{p.iterations}: success {p.success:.2f}, "
+                    f"deterministic {p.evaluation:.2f}, "
                     f"{p.steps_per_s:.0f} steps/s, {p.time_left_s / 60:.0f} min left"
                 )
 

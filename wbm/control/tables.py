@@ -29,7 +29,7 @@ class Tables:
     block: np.ndarray
     pair: np.ndarray
 
-    def upload(self, device: wp.context.Device) -> Tree:
+    def upload(self, device: wp.context.Device) -> Tree:  # pyright: ignore[reportGeneralTypeIssues]
         """The device struct of these tables."""
         tree = Tree()
         for name, value in self.tree.items():
@@ -62,7 +62,7 @@ def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray) -> Ta
     group = np.array([_group(robot, link) for link in spheres.link])
     order = np.argsort(group, kind="stable").astype(np.int32)
     names, starts = np.unique(group[order], return_index=True)
-    group_mask = np.array([_mask_of(mask, body[name]) for name in names], dtype=np.int64)
+    group_mask = np.array([_mask_of(mask, body[name]) for name in names], dtype=np.int64)  # pyright: ignore[reportArgumentType]
     block, pair = _blocks(np.asarray(pairs), group, names, order)
     group_parent, group_own, group_joint = _group_chain(group_mask)
     sphere_body = np.array([body[link] for link in spheres.link[order]], dtype=np.int32)

@@ -1,5 +1,8 @@
 """The whole-body controller: 16 joint velocities a step for many environments, inside every limit."""
 
+# Warp kernels and vectors have no useful static types.
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -255,7 +258,7 @@ class WholeBodyController:
         launch()  # compiles and loads the kernels, which a capture must not do
         with wp.ScopedCapture(self.device) as capture:
             launch()
-        return capture.graph
+        return capture.graph  # pyright: ignore[reportReturnType]
 
     def _run(self, kernel: wp.Kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

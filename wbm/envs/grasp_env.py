@@ -166,7 +166,7 @@ class GraspEnv:
         self.reader.begin(ids, scenes)
         self._obstacles(ids, scenes)
         self.posture[ids] = q[:, self._body]
-        self.controller.reset(ids)
+        self.controller.reset(ids)  # pyright: ignore[reportArgumentType]
         self.min_distance[ids] = 1.0  # the last episode's must not be observed
         self.outcome.reset(ids)
         self.previous[ids] = 0.0
@@ -195,7 +195,8 @@ class GraspEnv:
         Returns:
             The observation [N,O] (of the next episode where one ended), rewards [N], done flags [N] and a dictionary:
             `time_outs` [N] (ended by time alone), `outcome` [N] (see `outcome.REASONS`, `RUNNING` where it goes on),
-            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step belonged to,
+            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step
+            belonged to,
             `ctrl` [N,32] clean joint targets, and `ended`, what the step led to before any restart: `held`, `height`,
             `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
         """

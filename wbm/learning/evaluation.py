@@ -182,7 +182,7 @@ def run_block(world: EvaluationWorld, job: BlockJob) -> BlockResult:
     records = world.runner.run(world.driver, job.first, job.count, on_frame, on_end)
     if recorder:
         recorder.writer.close()
-    np.savez_compressed(job.folder / f"block-{job.first:05d}.npz", **tracks.done)
+    np.savez_compressed(job.folder / f"block-{job.first:05d}.npz", **tracks.done)  # pyright: ignore[reportArgumentType]
     return BlockResult(job.first, [world.row(r) for r in records])
 
 

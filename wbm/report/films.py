@@ -58,9 +58,7 @@ class FilmStudio:
         pos, quat = self.links.frames(["base", "camera"])
         camera = (pos[0, 1].numpy(), quat[0, 1].numpy())
         # The outer camera stands still: it looks at where base and target began.
-        return film_frame(
-            self._draw, self.scene, 0, trajectory.q[0, :3], trajectory.pose[0, 0, :3], camera, self.size
-        )
+        return film_frame(self._draw, self.scene, 0, trajectory.q[0, :3], trajectory.pose[0, 0, :3], camera, self.size)
 
     def film(self, scene_row: int, trajectory: Trajectory, path: Path, period: float, fps: float) -> None:
         """Write an MP4 of the episode."""

@@ -43,8 +43,8 @@ def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> int
                     raise ValueError(f"video {path}: frames are {shape[1]} x {shape[0]}, H.264 needs even sizes")
                 # its annotations are narrower than what it takes
                 writer = imageio_ffmpeg.write_frames(  # pyright: ignore
-                    str(path), (shape[1], shape[0]), fps=fps, codec="libx264", pix_fmt_out="yuv420p",
-                    macro_block_size=2, ffmpeg_log_level="error", quality=None, ffmpeg_timeout=60,
+                    str(path), (shape[1], shape[0]), fps=fps, codec="libx264", pix_fmt_out="yuv420p",  # pyright: ignore[reportArgumentType]
+                    macro_block_size=2, ffmpeg_log_level="error", quality=None, ffmpeg_timeout=60,  # pyright: ignore[reportArgumentType]
                     output_params=_H264,
                 )  # fmt: skip
                 writer.send(None)
