@@ -31,7 +31,7 @@ def scenes() -> tuple[SceneModel, SceneBank]:
     layout = ScenesConfig(
         count=4, test_count=0, kinds=("table",), num_distractors=DISTRACTORS, distractors=(0, DISTRACTORS)
     )
-    return model, generate_scenes(objects, layout, 0, model)
+    return model, generate_scenes(model, layout, 0)
 
 
 @functools.cache

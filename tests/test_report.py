@@ -66,7 +66,7 @@ def test_overlap():
 
 
 @pytest.mark.parametrize(
-    "change", [{"split": "dev"}, {"episodes": 0}, {"video_width": 321}, {"videos": -1}, {"hold_time_s": float("nan")}]
+    "change", [{"split": "dev"}, {"episodes": 0}, {"video_width": 321}, {"videos": -1}, {"condition": "speech"}]
 )
 def test_bad_configuration_is_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
