@@ -25,7 +25,13 @@ MAX_SHIFT = 0.015  # m that settling may move it
 
 
 def wanted(cfg: ScenesConfig, objects: ObjectSet) -> dict[str, int]:
-    """Scenes of every kind by split; splits without objects get none."""
+    """Scenes of every kind by split; val and test get none where they have no objects.
+
+    Raises:
+        ValueError: there are no objects for training.
+    """
+    if not (objects.split == "train").any():
+        raise ValueError(f"scenes: none of the {len(objects)} objects is for training; add objects or change the seed")
     count = {"train": cfg.count, "val": max(1, cfg.count // 10), "test": cfg.test_count}
     return {s: count[s] for s in SPLITS if count[s] > 0 and (objects.split == s).any()}
 
