@@ -130,6 +130,26 @@ def doctor(overrides: Overrides = None, debug: Debug = False, as_json: Json = Fa
 
 
 @app.command()
+def bench(
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="sensors, data, student or all.")],
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """The project's own benchmarks beside the peers."""
+    _call("bench", "bench", suite, as_json)
+
+
+@app.command()
+def view(
+    items: Items = None,
+    port: Annotated[int, typer.Option("--port", help="Port on 127.0.0.1.")] = 8080,
+    debug: Debug = False,
+) -> None:
+    """Look at an artifact, or the robot, in the browser."""
+    _call("view", "view", items or [], port)
+
+
+@app.command()
 def completion(shell: Annotated[str, typer.Argument(help="bash, zsh or fish.")], debug: Debug = False) -> None:
     """Print a completion script for your shell."""
     _call("completion", "script", shell)

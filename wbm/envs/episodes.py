@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -67,7 +67,7 @@ class Record:
     target_visible: float | None
     time_to_grasp_s: float | None
     max_force: float
-    extra: dict[str, Any] = field(default_factory=dict)
+    near: bool
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -202,7 +202,7 @@ class EpisodeRunner:
         env, s = self.env, self.env.state
         q, poses = s.q.float().clone(), env.object_poses().float().clone()
         episode, elapsed, phase = env.episode.clone(), env.elapsed.clone(), env.phase.clone()
-        distance, scene = s.centre_gap.clone(), env.scene.clone()
+        distance, scene, near = s.centre_gap.clone(), env.scene.clone(), env.started_near.clone()
         sight = None
         if self.perception:
             sight = self.perception.observe(q, s.qd.float(), poses, self._previous, elapsed)
@@ -216,7 +216,7 @@ class EpisodeRunner:
         self._previous.copy_(executed)
         ended = info["ended"]
         self._count(sight, elapsed, ended)
-        self._scene_of_done = scene
+        self._scene_of_done, self._near = scene, near
         self._code = info["outcome"]
         return Frame(episode, elapsed, q, poses, sight, action, executed, phase, distance, ended["held"], done)
 
@@ -251,4 +251,5 @@ class EpisodeRunner:
             target_visible=float(t["seen"][e]) / looked if looked > 0 else None,
             time_to_grasp_s=step * self.env.period if step >= 0 else None,
             max_force=float(t["force"][e]),
+            near=bool(self._near[e]),
         )

@@ -15,7 +15,7 @@ from wbm.envs.binding import SceneBinding
 from wbm.envs.config import EnvConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.observations import TeacherObservation
-from wbm.envs.outcome import RUNNING, TIMEOUT, UNSTABLE, Outcome
+from wbm.envs.outcome import RUNNING, SUCCESS, UNSTABLE, Outcome
 from wbm.envs.pregrasp import StartBank
 from wbm.envs.randomization import Randomizer
 from wbm.envs.sensing import StateReader
@@ -37,6 +37,7 @@ class GraspEnv:
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
         phase: 0 free space, 1 contact-rich [N].
+        started_near: episodes that started at the pre-grasp [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
     """
 
@@ -76,6 +77,7 @@ class GraspEnv:
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
         self.next_episode = 0
         self.phase = torch.ones(num_envs, dtype=torch.uint8, device=device)
+        self.started_near = torch.ones(num_envs, dtype=torch.bool, device=device)
 
     @property
     def limit_steps(self) -> int:
@@ -150,7 +152,9 @@ class GraspEnv:
         hand = self.cfg.randomization.start_hand
         if hand.on:
             q[:, joints.HAND] += hand.low + (hand.high - hand.low) * u[:, self._hand]
-            q[:, joints.HAND] = torch.maximum(torch.minimum(q[:, joints.HAND], self.action.hand.high), self.action.hand.low)
+            q[:, joints.HAND] = torch.maximum(
+                torch.minimum(q[:, joints.HAND], self.action.hand.high), self.action.hand.low
+            )
         self.episode[ids] = torch.from_numpy(episodes).to(self.device)
         self.scene[ids], self.elapsed[ids] = scenes, 0
         self._load_physics(ids, u, scenes)
@@ -163,6 +167,7 @@ class GraspEnv:
         self._obstacles(ids, scenes)
         self.posture[ids] = q[:, self._body]
         self.controller.reset(ids)
+        self.min_distance[ids] = 1.0  # the last episode's must not be observed
         self.outcome.reset(ids)
         self.previous[ids] = 0.0
         self.q_in.copy_(self.sim.qpos[:, : joints.NUM_JOINTS])
@@ -212,6 +217,9 @@ class GraspEnv:
         if self.cfg.action.term == "joint":
             self.ctrl[:, self._body] = term.target
             return
+        contact = (self.phase == 1).unsqueeze(1)
+        self.margin.copy_(torch.where(contact, self._contact_margin, 0.0))
+        self.base_weight.copy_(torch.where(contact[:, 0], self.cfg.contact_base, self._free_base))
         self.ee_velocity.copy_(term.velocity)
         self.ee_target.copy_(term.pos)
         self.ee_target_quat.copy_(term.quat)
@@ -225,14 +233,15 @@ class GraspEnv:
         self.sim.ctrl.copy_(self.ctrl if self.noise is None else self.ctrl + self.noise)
         self.sim.step(self.decimation)
         self.elapsed += 1
-        self._refresh()
-        reward, terms = rewards.total(self.state, action, self.previous, self.cfg.reward)
+        before = self.previous.clone()
         self.previous.copy_(action)
+        self._refresh()
+        reward, terms = rewards.total(self.state, action, before, self.cfg.reward)
         time_up = self._time_up()
         code = self.outcome.update(self.state, self.reader.start_pos, time_up)
         done = code != RUNNING
         timed = done & time_up
-        reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed)
+        reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed & (code != SUCCESS))
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
         info |= {"ctrl": self.ctrl.clone(), "ended": self._ended()}
@@ -269,6 +278,11 @@ class GraspEnv:
         self.gaze, self.posture = wp.to_torch(c.gaze_point), wp.to_torch(c.q_posture)
         self.frame_pos, self.frame_quat = wp.to_torch(c.frame_pos), wp.to_torch(c.frame_quat)
         self.min_distance = wp.to_torch(c.min_distance)
+        # In contact the fingers work beside the support, and a base that creeps would meet it.
+        self.margin = wp.to_torch(c.sphere_margin)
+        hand = torch.tensor([n.startswith("hand_") for n in c.spheres.names], device=self.device)
+        self._contact_margin, self._free_base = hand * self.cfg.hand_margin, c.cfg.weights.base
+        self.base_weight = wp.to_torch(c.weights)[:, list(c.weight_names).index("base")]
         self.obstacles = tuple(
             wp.to_torch(a) for a in (c.obstacle_type, c.obstacle_size, c.obstacle_pos, c.obstacle_quat)
         )

@@ -39,6 +39,7 @@ class RolloutsConfig:
         workers: processes; does not change the result.
         pregrasp_share: share of the episodes that start at the pre-grasp.
         keep: `successes`, or `all` for a short pipeline whose teacher has hardly learned.
+        physics: `evaluate` (fine physics) or `train` (the physics that teachers learn in, faster).
         seed_offset: added to the seed, so that rollouts never repeat the episodes of training or evaluation.
         samples: episodes of the first shard that are also written as MCAP.
         noise: what is injected into the executed action.
@@ -50,6 +51,7 @@ class RolloutsConfig:
     workers: int = field(default=2, metadata={"key": False})
     pregrasp_share: float = 0.3
     keep: str = "successes"
+    physics: str = "evaluate"
     seed_offset: int = 10_000
     samples: int = 2
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -59,5 +61,7 @@ class RolloutsConfig:
             raise ValueError("rollouts: shards, episodes, num_envs and workers must be at least 1")
         if self.keep not in ("successes", "all"):
             raise ValueError(f"rollouts.keep={self.keep}: use successes or all")
+        if self.physics not in ("evaluate", "train"):
+            raise ValueError(f"rollouts.physics={self.physics}: use evaluate or train")
         if not 0 <= self.pregrasp_share <= 1:
             raise ValueError(f"rollouts.pregrasp_share must be in [0, 1], not {self.pregrasp_share}")

@@ -22,9 +22,6 @@ class WholeBodyEnv(GraspEnv):
     In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed in the
     world (a target that followed the base would make the controller chase itself), and the posture is the pre-grasp's. A
     teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves through both phases alike.
-
-    Attributes:
-        started_near: episodes [N] that started at the pre-grasp.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -36,7 +33,6 @@ class WholeBodyEnv(GraspEnv):
         self._contact_since = torch.zeros(n, dtype=torch.int64, device=device)
         self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
         self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
-        self.started_near = torch.zeros(n, dtype=torch.bool, device=device)
 
     @property
     def limit_steps(self) -> int:
