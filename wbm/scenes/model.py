@@ -18,6 +18,7 @@ from wbm.robot.facts import quat_to_mat
 from wbm.robot.mjcf import OBJECT_BIT, ROBOT_BIT, STATIC_BIT, MjcfOptions, add_contact_sensors, build_robot
 from wbm.robot.model import load_robot
 from wbm.scenes.bank import NUM_SUPPORTS, SceneBank
+from wbm.scenes.fields import body_tables, columns, write
 from wbm.scenes.objects import ObjectSet
 from wbm.scenes.parts import BOX, MAX_PARTS, MESH, Part, part_mesh
 
@@ -84,7 +85,7 @@ class SceneModel:
         self.sensors = tuple(model.sensor(i).name for i in range(model.nsensor))
         self.robot_nq = len(self.robot.joint_names)
         self._robot_mass = float(model.body_subtreemass[0] - model.body_mass[self.body_ids].sum())
-        self._tables = self._geom_tables() | _body_tables(objects)
+        self._tables = self._geom_tables() | body_tables(objects)
         native = self.cfg.slots == "native"
         self.geom_fields = tuple(f for f in _GEOM_FIELDS if native or f != "geom_type") + (
             _BIT_FIELDS if native else ()
@@ -131,15 +132,15 @@ class SceneModel:
         tables = self._tables
         for name in self.geom_fields:
             values = tables[name][chosen]
-            _write(field(name), ids, self._slots, values.reshape(count, width * MAX_PARTS, *values.shape[3:]))
+            write(field(name), ids, self._slots, values.reshape(count, width * MAX_PARTS, *values.shape[3:]))
         self._load_supports(field, ids, bank, scenes)
         if friction is not None:
-            per_slot = np.repeat(np.broadcast_to(_columns(friction), (count, width)), MAX_PARTS, axis=1)
-            _write(field("geom_friction"), ids, self._slots, per_slot, component=0)
-        scale = np.ones((count, width)) if mass_scale is None else np.broadcast_to(_columns(mass_scale), (count, width))
+            per_slot = np.repeat(np.broadcast_to(columns(friction), (count, width)), MAX_PARTS, axis=1)
+            write(field("geom_friction"), ids, self._slots, per_slot, component=0)
+        scale = np.ones((count, width)) if mass_scale is None else np.broadcast_to(columns(mass_scale), (count, width))
         self._load_masses(field, ids, chosen, scale)
         poses = np.concatenate([bank.object_pos[scenes], bank.object_quat[scenes]], axis=2).reshape(count, -1)
-        _write(qpos, ids, slice(0, self.object_qpos.stop), np.concatenate([bank.q_start[scenes], poses], axis=1))
+        write(qpos, ids, slice(0, self.object_qpos.stop), np.concatenate([bank.q_start[scenes], poses], axis=1))
 
     def _load_supports(self, field: Field, ids: np.ndarray, bank: SceneBank, scenes: np.ndarray) -> None:
         size = bank.support_size[scenes]
@@ -151,10 +152,10 @@ class SceneModel:
             "geom_aabb": np.concatenate([np.zeros_like(size), size], axis=2),
         }
         for name, value in values.items():
-            _write(field(name), ids, self._supports, value)
+            write(field(name), ids, self._supports, value)
         if "geom_contype" in self.geom_fields:
             used = np.arange(NUM_SUPPORTS) < bank.support_count[scenes, None]
-            _write(field("geom_contype"), ids, self._supports, np.where(used, STATIC_BIT, 0))
+            write(field("geom_contype"), ids, self._supports, np.where(used, STATIC_BIT, 0))
 
     def _load_masses(self, field: Field, ids: np.ndarray, chosen: np.ndarray, scale: np.ndarray) -> None:
         tables = self._tables
@@ -169,12 +170,12 @@ class SceneModel:
             "body_subtreemass": mass,
         }
         for name, value in values.items():
-            _write(field(name), ids, self._bodies, value)
-        _write(field("body_subtreemass"), ids, slice(0, 1), self._robot_mass + mass.sum(axis=1, keepdims=True))
+            write(field(name), ids, self._bodies, value)
+        write(field("body_subtreemass"), ids, slice(0, 1), self._robot_mass + mass.sum(axis=1, keepdims=True))
         count = len(ids)
-        _write(field("dof_M0"), ids, self._dofs, (tables["dof_M0"][chosen] * scale[..., None]).reshape(count, -1))
+        write(field("dof_M0"), ids, self._dofs, (tables["dof_M0"][chosen] * scale[..., None]).reshape(count, -1))
         inverse = tables["dof_invweight0"][chosen] / scale[..., None]
-        _write(field("dof_invweight0"), ids, self._dofs, inverse.reshape(count, -1))
+        write(field("dof_invweight0"), ids, self._dofs, inverse.reshape(count, -1))
 
     def _template(self) -> mujoco.MjSpec:
         spec = self._base_spec()
@@ -345,6 +346,7 @@ def _add_support(spec: mujoco.MjSpec, i: int, size: np.ndarray, pos: np.ndarray,
 def _add_slot(body: mujoco.MjsBody, **geom: Any) -> None:
     # Priority: the object's friction and contact parameters decide every contact it takes part in.
     body.add_geom(contype=OBJECT_BIT, conaffinity=EVERYTHING, priority=1, mass=0.0, **geom)
+<<<<<<< HEAD
 
 
 def _body_tables(objects: ObjectSet) -> dict[str, np.ndarray]:
@@ -397,3 +399,5 @@ def _write(target: Any, ids: np.ndarray, columns: slice, values: np.ndarray, com
         target[ids, columns] = values
     else:
         target[ids, columns, component] = values
+=======
+>>>>>>> scenes
