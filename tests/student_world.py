@@ -1,7 +1,7 @@
 """A synthetic world for the student's tests: coloured blobs on a table; actions point from grasp frame to target.
 
-The target is marked by the mask and named by an instruction ("pick up the red thing"), whose embedding is a fixed random
-vector per sentence. Everything that the student must output is a simple function of the target's position.
+The target is marked by the mask and named by an instruction ("pick up the red thing"), whose embedding is a fixed
+random vector per sentence. Everything that the student must output is a simple function of the target's position.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ def embed(sentence: str, dim: int = SCHEMA.text_dim) -> np.ndarray:
 
 
 def make_episode(seed: int, length: int = 20, schema: PolicySchema = SCHEMA) -> dict:
-    """A whole episode in `EpisodeWriter.add`'s form; the grasp frame moves towards one of three blobs."""
+    """A whole episode in `EpisodeWriter.add`'s form, with three blobs, one of them the target."""
     rng = np.random.default_rng(seed)
     p, m = schema.num_depth_points, schema.num_lidar_points
     names = rng.permutation(list(COLOURS))[:3]
-    centres = np.stack([rng.uniform(0.4, 0.9, 3), np.array([-0.25, 0.0, 0.25]) + rng.uniform(-0.05, 0.05, 3)], 1)
+    centres = np.stack([rng.uniform(0.4, 0.9, 3), rng.permutation([-0.25, 0.0, 0.25]) + rng.uniform(-0.05, 0.05, 3)], 1)
     centres = np.column_stack([centres, np.full(3, 0.45)])
     goal = centres[0]
     rng.shuffle(order := np.arange(3))
@@ -40,7 +40,6 @@ def make_episode(seed: int, length: int = 20, schema: PolicySchema = SCHEMA) -> 
     ee = rng.uniform([0.2, -0.4, 0.4], [0.6, 0.4, 0.9])
     out: dict = {k: [] for k in ("depth_xyz", "depth_rgb", "depth_valid", "depth_target", "lidar_xyz", "lidar_valid")}
     out |= {k: [] for k in ("proprio", "prev_action", "action", "ee_distance")}
-    previous = np.zeros(32)
     for _ in range(length):
         xyz = np.where(
             (kind < 3)[:, None],
@@ -63,11 +62,10 @@ def make_episode(seed: int, length: int = 20, schema: PolicySchema = SCHEMA) -> 
         out["lidar_xyz"].append(rng.uniform(-2.0, 2.0, (m, 3)))
         out["lidar_valid"].append(np.ones(m))
         out["proprio"].append(proprio)
-        out["prev_action"].append(previous)
+        out["prev_action"].append(rng.standard_normal(32))  # tells nothing of the target, nor does the state
         out["action"].append(action)
         out["ee_distance"].append(np.linalg.norm(delta))
-        previous = action
-        ee = ee + 0.15 * delta + rng.normal(0.0, 0.01, 3)
+        ee = goal + rng.uniform(-0.2, 0.2, 3) if rng.random() < 0.3 else rng.uniform([0.2, -0.4, 0.4], [0.6, 0.4, 0.9])
     episode = {k: np.asarray(v) for k, v in out.items()}
     episode["depth_rgb"] = np.clip(episode["depth_rgb"], 0, 255).astype(np.uint8)
     sentences = [f"pick up the {names[0]} thing", f"grasp {names[0]}"]
@@ -91,13 +89,13 @@ def make_episode(seed: int, length: int = 20, schema: PolicySchema = SCHEMA) -> 
 
 
 def write_shards(
-    folder: Path, episodes: int, shards: int = 2, length: int = 20, schema: PolicySchema = SCHEMA
+    folder: Path, episodes: int, shards: int = 2, length: int = 20, schema: PolicySchema = SCHEMA, first_seed: int = 0
 ) -> list[Path]:
     """Shards of synthetic episodes; their indices."""
     paths = []
     for shard in range(shards):
         writer = EpisodeWriter(folder, schema, shard)
         for seed in range(shard, episodes, shards):
-            writer.add(make_episode(seed, length, schema))
+            writer.add(make_episode(first_seed + seed, length, schema))
         paths.append(writer.close())
     return paths

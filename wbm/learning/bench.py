@@ -18,7 +18,7 @@ import torch
 from wbm.artifacts.episodes import EpisodeWriter
 from wbm.learning.dataset import EpisodeDataset, to_tensors
 from wbm.learning.distill_loss import distill_loss
-from wbm.learning.export import export_onnx, make_session, random_observation
+from wbm.learning.export import check_parity, export_onnx, make_session, random_observation
 from wbm.learning.student import Student, StudentPolicy, count_parameters
 from wbm.learning.student_config import DistillConfig, StudentConfig
 from wbm.robot.schema import PolicySchema
@@ -77,10 +77,9 @@ def bench_student(
 
     Returns:
         "torch" and "onnx", each with "p50_ms" and "p99_ms" of a policy step; "p50_ms" and "p99_ms" of ONNX Runtime,
-        which the robot runs; "train_samples_per_s" on one core; "parameters"; "parity", the largest difference between both.
+        which the robot runs; "train_samples_per_s" on one core; "parameters"; "parity", the largest
+        difference between both.
     """
-    from wbm.learning.export import check_parity
-
     schema = PolicySchema()
     student = student or StudentConfig()
     before = torch.get_num_threads()

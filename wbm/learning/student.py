@@ -1,5 +1,8 @@
 """The student: one transformer over tokens of an observation, for all 32 joints (paper, section D)."""
 
+# torch types registered buffers as Tensor | Module.
+# pyright: reportCallIssue=false
+
 from __future__ import annotations
 
 import json
@@ -10,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -188,11 +192,13 @@ def load_student(path: str | Path, device: str | torch.device = "cpu") -> Studen
     spec = json.loads((folder / SPEC_FILE).read_text(encoding="utf-8"))
     if spec.get("version") != SPEC_VERSION:
         raise ValueError(f"{folder / SPEC_FILE} has version {spec.get('version')}, this version reads {SPEC_VERSION}")
-    network = Student(PolicySchema.from_dict(spec["schema"]), StudentConfig(**spec["config"]))
+    schema = PolicySchema.from_dict(spec["schema"])
     try:
+        network = Student(schema, StudentConfig(**spec["config"]))
         network.load_state_dict(load_file(folder / WEIGHTS_FILE))
-    except RuntimeError as error:
-        raise ValueError(f"{folder / WEIGHTS_FILE} does not fit its specification: {error}") from error
+    except (RuntimeError, TypeError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{folder / WEIGHTS_FILE} does not fit its specification: {reason}") from error
     return StudentPolicy(network, device)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+_LARGEST = 8192  # a specification from a stranger must not ask for all memory
+
 
 @dataclass(frozen=True)
 class StudentConfig:
@@ -40,6 +42,7 @@ class StudentConfig:
     use_mask: bool = True
 
     def __post_init__(self) -> None:
+        least = {"lidar_tokens": 0}
         for name in (
             "width",
             "layers",
@@ -48,14 +51,14 @@ class StudentConfig:
             "point_width",
             "attention_tokens",
             "proprio_tokens",
+            "lidar_tokens",
             "chunk",
         ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"student.{name} must be at least 1, is {getattr(self, name)}")
+            low, value = least.get(name, 1), getattr(self, name)
+            if not low <= value <= _LARGEST:
+                raise ValueError(f"student.{name} must lie in [{low}, {_LARGEST}], is {value}")
         if self.width % self.heads:
             raise ValueError(f"student.width {self.width} must be a multiple of student.heads {self.heads}")
-        if self.lidar_tokens < 0:
-            raise ValueError(f"student.lidar_tokens must not be negative, is {self.lidar_tokens}")
         if self.local_radius < 0:
             raise ValueError(f"student.local_radius must not be negative, is {self.local_radius}")
         if not (self.use_text or self.use_mask):

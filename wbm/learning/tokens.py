@@ -4,6 +4,9 @@ All inputs are the fields of the policy schema in SI units; normalisation happen
 the weights. An invalid point never reaches a pooled value: clouds may be empty.
 """
 
+# torch types registered buffers as Tensor | Module.
+# pyright: reportOperatorIssue=false
+
 from __future__ import annotations
 
 import torch
@@ -54,7 +57,9 @@ def local_shape(xyz: Tensor, rgb: Tensor, valid: Tensor, radius: float) -> Tenso
     Returns:
         [B,P,13], offsets and covariances in units of the radius.
     """
-    scaled = xyz / radius
+    # second moments cancel where the origin is far: take it amid the points
+    centre = (xyz * valid).sum(1, keepdim=True) / valid.sum(1, keepdim=True).clamp(min=1.0)
+    scaled = (xyz - centre) / radius
     square = (scaled * scaled).sum(-1, keepdim=True)
     one = torch.ones_like(square)
     # 1 - |a - b|^2 as a single product: a pass over [B,P,P] costs more than the arithmetic in it
@@ -65,7 +70,7 @@ def local_shape(xyz: Tensor, rgb: Tensor, valid: Tensor, radius: float) -> Tenso
     moments = torch.stack([x * x, y * y, z * z, x * y, x * z, y * z], dim=-1)
     sums = weight @ (torch.cat([one, scaled, moments, rgb], dim=-1) * valid)
     count = sums[..., :1]
-    mean = sums[..., 1:] / (count + 1e-6)
+    mean = sums[..., 1:] / count.clamp(min=0.5)  # a valid point counts itself
     mx, my, mz = mean[..., :3].unbind(-1)
     outer = torch.stack([mx * mx, my * my, mz * mz, mx * my, mx * mz, my * mz], dim=-1)
     return torch.cat([0.1 * count, mean[..., :3] - scaled, mean[..., 3:9] - outer, mean[..., 9:]], dim=-1) * valid

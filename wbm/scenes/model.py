@@ -391,8 +391,8 @@ def _write(target: Any, ids: np.ndarray, columns: slice, values: np.ndarray, com
     if not isinstance(target, np.ndarray):
         import torch
 
-        values = torch.as_tensor(np.ascontiguousarray(values), dtype=target.dtype, device=target.device)
-        ids = torch.as_tensor(ids, device=target.device)
+        values = torch.as_tensor(np.ascontiguousarray(values), dtype=target.dtype, device=target.device)  # pyright: ignore[reportAssignmentType]
+        ids = torch.as_tensor(ids, device=target.device)  # pyright: ignore[reportAssignmentType]
     if component is None:
         target[ids, columns] = values
     else:
