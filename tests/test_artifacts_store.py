@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -170,6 +171,25 @@ def test_a_silent_holder_on_another_host_is_replaced_after_a_term(store, monkeyp
     taken = acquire(store.backend, "leases/x", wait_s=5)
     assert taken.token == frozen.token + 1
     taken.release()
+
+
+def test_renewal_survives_a_store_that_is_out_of_reach_for_a_while(store, monkeypatch):
+    monkeypatch.setattr(lease, "TERM_S", 0.15)
+    held = acquire(store.backend, "leases/x")
+    real, failures = store.backend.write, []
+
+    def write(*arguments):
+        if len(failures) < 3:
+            failures.append(1)
+            raise ArtifactError("out of reach")
+        return real(*arguments)
+
+    monkeypatch.setattr(store.backend, "write", write)
+    deadline = time.monotonic() + 20
+    while b'"beat": 0' in store.backend.read("leases/x")[0]:
+        assert time.monotonic() < deadline, "renewal has stopped"
+        time.sleep(0.02)
+    held.release()
 
 
 def test_a_renewing_holder_is_not_replaced(store, monkeypatch):
