@@ -39,7 +39,7 @@ def place(c: WholeBodyController, seed: int, spread: float = 0.4) -> None:
     c.obstacle_size.numpy()[:, 0] = [0.4, 0.8, 0.025]
     c.obstacle_size.numpy()[:, 1] = 0.05
     c.obstacle_pos.numpy()[:, 0] = [1.2, 0, 0.3]
-    c.obstacle_pos.numpy()[:, 1] = [*target, 0.0, 0.25, 0.05]
+    c.obstacle_pos.numpy()[:, 1] = target + np.array([0.0, 0.25, 0.05])
     c.obstacle_quat.numpy()[:] = [1, 0, 0, 0]
     c.reset(None)
 
