@@ -88,8 +88,9 @@ def _compare_groups(old: Path, new: Path, where: str) -> Iterator[FirstDifferenc
         if not isinstance(a, zarr.Array) or not isinstance(b, zarr.Array):
             yield FirstDifference(where, name, -1, f"only in the {'second' if a is None else 'first'}", 0)
             continue
-        step = (a.shards or a.chunks)[0] if a.shape else 1
-        rows = min(a.shape[0], b.shape[0]) if a.shape and b.shape and a.shape[1:] == b.shape[1:] else 0
+        ours, theirs = tuple(a.shape or ()), tuple(b.shape or ())
+        step = (a.shards or a.chunks)[0] if ours else 1
+        rows = min(ours[0], theirs[0]) if ours and theirs and ours[1:] == theirs[1:] else 0
         for start in range(0, rows, step):
             stop = min(start + step, rows)
             found = _first_row(np.asarray(a[start:stop]), np.asarray(b[start:stop]))
