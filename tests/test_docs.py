@@ -1,4 +1,4 @@
-"""Every `wbm` command that the README prints works as printed; `make setup` and `make run` are continuous integration's."""
+"""Every `wbm` command that the README prints works; `make setup` and `make run` are continuous integration's."""
 
 import os
 import re
