@@ -3,4 +3,4 @@
 import warp as wp
 
 # Which module was loaded from which cache is of no use to the users of a pipeline.
-wp.config.log_level = wp.LOG_WARNING
+wp.config.log_level = wp.LOG_ERROR

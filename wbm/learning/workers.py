@@ -52,7 +52,7 @@ def _quiet() -> None:
     import warp as wp
 
     torch.set_num_threads(1)
-    wp.config.log_level = wp.LOG_WARNING
+    wp.config.log_level = wp.LOG_ERROR
 
 
 def _work(module: str, job: Any) -> Any:

@@ -271,7 +271,7 @@ def bench_sensors(
         peers: also time mujoco-lidar and embreex when they are installed.
         assets: objects and scene bank of an assets artifact for the comparison; None uses generated table tops.
     """
-    wp.config.log_level = wp.LOG_WARNING
+    wp.config.log_level = wp.LOG_ERROR
     scaling = measure_speed(SIZES, 32, rounds, peers)
     typical = {k: v for k, v in next(row for row in scaling if row["instances"] == TYPICAL).items() if k != "instances"}
     return typical | measure_exactness(num_scenes, num_rays, assets) | {"instances_scaling": scaling}
