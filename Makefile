@@ -32,7 +32,7 @@ run: setup
 	$(WBM) run profile=smoke $(ARGS)
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --durations=10
 
 check: setup
 	$(BIN)/ruff check .

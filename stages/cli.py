@@ -20,6 +20,10 @@ app = typer.Typer(
 )
 artifacts_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Look after what the stages published.")
 app.add_typer(artifacts_app, name="artifacts")
+robot_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The robot that everything is built on.")
+app.add_typer(robot_app, name="robot")
+bundle_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made.")
+app.add_typer(bundle_app, name="bundle")
 
 STAGES = {
     "prepare-assets": "Stage 1: objects, convex parts, settled scenes.",
@@ -130,6 +134,26 @@ def doctor(overrides: Overrides = None, debug: Debug = False, as_json: Json = Fa
 
 
 @app.command()
+def bench(
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="sensors, data, student or all.")],
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """The project's own benchmarks beside the peers."""
+    _call("bench", "bench", suite, as_json)
+
+
+@app.command()
+def view(
+    items: Items = None,
+    port: Annotated[int, typer.Option("--port", help="Port on 127.0.0.1.")] = 8080,
+    debug: Debug = False,
+) -> None:
+    """Look at an artifact, or the robot, in the browser."""
+    _call("view", "view", items or [], port)
+
+
+@app.command()
 def completion(shell: Annotated[str, typer.Argument(help="bash, zsh or fish.")], debug: Debug = False) -> None:
     """Print a completion script for your shell."""
     _call("completion", "script", shell)
@@ -192,6 +216,33 @@ def pin(
 def rm(items: Items = None, force: Force = False, debug: Debug = False, as_json: Json = False) -> None:
     """Delete an artifact that nothing was made from."""
     _call("commands_artifacts", "rm", items or [], force, as_json)
+
+
+FilePath = Annotated[str, typer.Argument(metavar="PATH", help="A file or folder.")]
+
+
+@robot_app.command("show")
+def robot_show(debug: Debug = False, as_json: Json = False) -> None:
+    """Joints, limits, masses and spheres."""
+    _call("commands_robot", "robot_show", as_json)
+
+
+@robot_app.command("export")
+def robot_export(path: FilePath, debug: Debug = False) -> None:
+    """Write a standalone MJCF that opens in MuJoCo's viewer."""
+    _call("commands_robot", "robot_export", path)
+
+
+@bundle_app.command("show")
+def bundle_show(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+    """The contract and provenance of a bundle."""
+    _call("commands_robot", "bundle", path, False, as_json)
+
+
+@bundle_app.command("verify")
+def bundle_verify(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+    """Check every part of a bundle, and its golden vectors."""
+    _call("commands_robot", "bundle", path, True, as_json)
 
 
 Remote = Annotated[str, typer.Argument(metavar="URL", help="s3://bucket/prefix or a directory.")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 from collections.abc import Sequence
@@ -79,7 +78,7 @@ def run_command(options: Options) -> None:
     if options.cfg:
         _print_config(options, composed)
     elif options.launcher == "slurm":
-        importlib.import_module("stages.submit").submit(options, composed)
+        raise ConfigError("--launcher slurm is not available in this version: call wbm from an sbatch script")
     elif options.multirun:
         _sweep(options, composed)
     else:

@@ -15,7 +15,7 @@ def name(cfg: Any) -> str:
 
 
 def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
-    """Export to ONNX, write the contract, the golden vectors and the sentences; check all of it on the finished file."""
+    """Export to ONNX; write contract, golden vectors and sentences; check all of it on the finished file."""
     from stages.deploy_golden import golden_observations, normalisers, rollout_parity
     from wbm.deploy.bundle import Bundle, write_bundle
     from wbm.deploy.contract import make_contract
@@ -82,6 +82,6 @@ def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
 
 
 def _source(manifest: Any) -> dict[str, Any]:
-    """What a roboticist must know to trace an input; no times and no host names, so that equal inputs give equal bundles."""
+    """What traces an input; no times and no host names, so that equal inputs give equal bundles."""
     numbers = {k: v for k, v in manifest.metrics.items() if isinstance(v, (int, float)) and not k.endswith("seconds")}
     return {"ref": manifest.ref, "content_digest": manifest.content_digest, "metrics": numbers}

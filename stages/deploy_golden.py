@@ -1,5 +1,8 @@
 """Golden vectors and parity of an export, from the evaluation's recorded episodes where it has any."""
 
+# torch types registered buffers as Tensor | Module.
+# pyright: reportCallIssue=false
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -34,7 +37,7 @@ def recorded_episode(schema: PolicySchema, evaluation: Path) -> dict[str, np.nda
 
 
 def golden_observations(schema: PolicySchema, evaluation: Path, count: int) -> dict[str, np.ndarray]:
-    """`count` observations: steps spread over a recorded episode, filled up with random ones, the last with empty clouds."""
+    """`count` observations: steps spread over a recorded episode, and one random one with empty clouds at the end."""
     from wbm.learning.export import random_observation
 
     golden = random_observation(schema, count, seed=0)

@@ -34,7 +34,7 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
 
     objects, report = collect_objects(cfg.objects, cfg.seed, lambda jobs: progress.track(jobs, "objects"))
     model = SceneModel(objects, SceneModelConfig(num_distractors=cfg.scenes.num_distractors), cfg.robot)
-    bank = generate_scenes(objects, cfg.scenes, cfg.seed, model, lambda jobs: progress.track(jobs, "scenes"))
+    bank = generate_scenes(model, cfg.scenes, cfg.seed, lambda jobs: progress.track(jobs, "scenes"))
     bank, sentences = write_instructions(objects, bank, cfg.seed)
     texts = Texts(sentences, SentenceEncoder(cfg.scenes.encoder)(sentences.tolist()))
 

@@ -31,7 +31,9 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         shown = robot_items()
     else:
         artifact = store.resolve(names[0])
-        world = next((store.resolve(r.ref) for r in artifact.manifest.inputs.values() if r.ref.startswith("assets/")), None)
+        world = next(
+            (store.resolve(r.ref) for r in artifact.manifest.inputs.values() if r.ref.startswith("assets/")), None
+        )
         shown = items_of(artifact.path, artifact.manifest.kind, world.path if world else None)
     viewer = Viewer(shown, port)
     sys.stderr.write(f"{viewer.address} shows {names[0]} ({len(shown)} to choose from); Ctrl+C ends\n")
@@ -69,7 +71,9 @@ def items_of(path: Path, kind: str, assets: Path | None = None) -> list[Shown]:
         folder = next((path / f for f in _EPISODE_FOLDERS if list((path / f).glob("shard-*.json"))), None)
         shown = _episode_items(folder, assets) if folder else []
     if not shown:
-        raise ValueError(f"{kind} at {path} holds no episodes and no scenes to view; try rollouts, evaluation, assets or robot")
+        raise ValueError(
+            f"{kind} at {path} holds no episodes and no scenes to view; try rollouts, evaluation, assets or robot"
+        )
     return shown
 
 

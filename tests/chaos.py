@@ -36,34 +36,37 @@ def command(module: str, *arguments: str) -> list[str]:
     return [sys.executable, "-m", module, *arguments]
 
 
+SLOW = {**ENV, "TOY_SLEEP": "0.05"}
+
+
 def digests(module: str, *arguments: str) -> dict[str, str]:
     """Content digests after an undisturbed run."""
-    done = subprocess.run(command(module, "run", "--json", *arguments), env=ENV, capture_output=True, text=True)
+    done = subprocess.run(command(module, "run", "--json", *arguments), env=SLOW, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return {s["artifact"]: s["content_digest"] for s in json.loads(done.stdout)["stages"]}
 
 
-def storm(
-    folder: Path, kills: int, module: str = "toy", longest: float = 1.6, shards: int = 8, seed: int = 0
-) -> Damage:
+def storm(folder: Path, kills: int, module: str = "toy", shards: int = 8, seed: int = 0) -> Damage:
     """Run pipelines under one seed after another, killing with SIGKILL at random moments, until `kills` are spent."""
     rng, damage, number = random.Random(seed), Damage(), 0
     while damage.kills < kills:
         number += 1
+        began = time.monotonic()
         calm = digests(module, f"seed={number}", f"artifacts.root={folder / 'calm'}")
+        undisturbed = time.monotonic() - began
         log = folder / f"log-{number}"
         arguments = [f"seed={number}", f"artifacts.root={folder / 'storm'}"]
         finished = False
         while not finished and damage.kills < kills:
             process = subprocess.Popen(
                 command(module, "run", *arguments),
-                env={**ENV, "TOY_LOG": str(log), "TOY_SLEEP": "0.05"},
+                env={**SLOW, "TOY_LOG": str(log)},
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
                 start_new_session=True,
             )
             try:
-                _, err = process.communicate(timeout=rng.uniform(0.3, longest))
+                _, err = process.communicate(timeout=rng.uniform(0.3, 0.8) * undisturbed)
                 finished = True
                 if process.returncode:
                     damage.problems.append(err.decode()[-500:])
@@ -79,6 +82,7 @@ def storm(
         if digests(module, *arguments) != calm:
             damage.problems.append(f"seed {number}: other bytes than an undisturbed run")
         damage.pipelines += 1
+        print(f"{damage.kills} kills, {damage.pipelines} pipelines, {len(damage.problems)} problems", flush=True)
         if log.exists():
             damage.shards_written += len(log.read_text().splitlines())
             damage.shards_needed += shards
@@ -92,8 +96,7 @@ def main() -> None:
     options = parser.parse_args()
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        module, longest = ("stages.cli", 120.0) if options.real else ("toy", 2.5)
-        damage = storm(Path(folder), options.kills, module, longest)
+        damage = storm(Path(folder), options.kills, "stages.cli" if options.real else "toy")
     redone = damage.shards_written - damage.shards_needed
     print(f"{damage.kills} kills, {damage.pipelines} pipelines, {time.monotonic() - began:.0f} s")
     print(f"{redone} shards written twice, {len(damage.problems)} problems")

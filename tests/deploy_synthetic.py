@@ -123,7 +123,7 @@ class FakeRobot:
             depth_rgb=self.rng.integers(0, 256, (p, 3), dtype=np.uint8),
             depth_valid=np.ones(p, dtype=np.uint8),
             depth_target=np.zeros(p, dtype=np.uint8),
-            lidar_xyz=(self.rng.normal(size=(m, 3)) + [2.0, 0, 0]).astype(np.float32),
+            lidar_xyz=(self.rng.normal(size=(m, 3)) + np.array([2.0, 0, 0])).astype(np.float32),
             lidar_valid=np.ones(m, dtype=np.uint8),
         )
 

@@ -9,7 +9,7 @@ from wbm.scenes.objects import stack_objects
 from wbm.scenes.procedural import draw_objects
 
 OBJECTS = ObjectsConfig(count=68)
-SCENES = ScenesConfig(count=6, test_count=3)
+SCENES = ScenesConfig(count=5, test_count=2)
 
 
 @cache
@@ -24,4 +24,4 @@ def small_model(slots="native"):
 
 @cache
 def small_bank():
-    return generate_scenes(small_objects(), SCENES, 0, small_model())
+    return generate_scenes(small_model(), SCENES, 0)

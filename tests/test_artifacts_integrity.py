@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 import torch
+import zarr
 from artifacts_support import manifest, publish
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -285,6 +286,10 @@ def test_the_first_difference_is_named(tmp_path):
     assert (found.path, found.tensor, found.step) == ("data.zarr", "x", 7)
     assert "15.0 and 16.0 at [1]" in found.detail
     store = Store.open(tmp_path)
+    scalars = [store.begin(manifest(name="s", seed=i)) for i in range(2)]
+    for value, draft in enumerate(scalars):
+        zarr.open_group(draft.path / "g.zarr", mode="w").create_array("total", data=np.array(value))
+    assert compare.first_difference(*(draft.publish() for draft in scalars)).tensor == "total"
     left = store.begin(manifest(name="w", seed=1))
     right = store.begin(manifest(name="w", seed=2))
     save_file({"a": np.zeros(3), "b": np.zeros(3)}, left.path / "w.safetensors")

@@ -21,7 +21,7 @@ from wbm.artifacts.store import Store
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 ENV = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-LINES = 500 if os.environ.get("WBM_FULL") else 24
+LINES = 500 if os.environ.get("WBM_FULL") else 12
 
 
 def override_line(rng):
@@ -194,7 +194,7 @@ def test_completion_offers_commands_options_groups_keys_and_values():
     assert complete("run", "profile=l") == ["profile=laptop"]
     assert complete("run", "-m", "teacher=side,t") == ["teacher=side,top_down"]
     assert complete("run", "distill.l") == ["distill.lr=", "distill.lr_final="]
-    assert complete("run", "sens") == ["sensors."]
+    assert complete("run", "sens") == ["sensors.", "sensors="]
     assert complete("run", "env.end_on_collision=") == ["env.end_on_collision=false", "env.end_on_collision=true"]
     assert complete("artifacts", "ve") == ["verify"]
     assert complete("completion", "f") == ["fish"]

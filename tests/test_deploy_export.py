@@ -65,7 +65,15 @@ def record(folder: Path) -> dict[str, np.ndarray]:
     episode |= {k: rng.normal(size=(STEPS, n)).astype(np.float32) for k, n in flat.items()}
     episode |= {"ee_distance": np.ones(STEPS, np.float32), "stamp": np.arange(STEPS, dtype=np.float32) / 25}
     episode |= {"phase": np.zeros(STEPS, np.uint8), "instructions": ["pick up the mug", "take the mug"], "text": text}
-    facts = {"scene": "0", "object": "mug", "teacher": "top_down", "noise": 0.0, "start": "full", "success": True, "seed": 1}
+    facts = {
+        "scene": "0",
+        "object": "mug",
+        "teacher": "top_down",
+        "noise": 0.0,
+        "start": "full",
+        "success": True,
+        "seed": 1,
+    }
     writer = EpisodeWriter(folder, SCHEMA, 0)
     writer.add({**episode, **facts})
     writer.close()
@@ -94,10 +102,16 @@ def export(world, path: Path, monkeypatch, evaluation: str = "evaluation") -> Dr
     folder, texts, _ = world
     from wbm.learning import export as exporter
 
-    model = exporter.export_onnx if not (folder / "policy.onnx").exists() else (lambda _: (folder / "policy.onnx").read_bytes())
+    model = (
+        exporter.export_onnx
+        if not (folder / "policy.onnx").exists()
+        else (lambda _: (folder / "policy.onnx").read_bytes())
+    )
     monkeypatch.setattr("wbm.learning.export.export_onnx", model)  # eight seconds, once; its own tests repeat it
     monkeypatch.setattr("wbm.scenes.assets.load_assets", lambda path: SimpleNamespace(texts=texts))
-    manifests = {s: SimpleNamespace(name="main", ref=f"{s}/main/0", content_digest="d", metrics={}) for s in deploy_export.INPUTS}
+    manifests = {
+        s: SimpleNamespace(name="main", ref=f"{s}/main/0", content_digest="d", metrics={}) for s in deploy_export.INPUTS
+    }
     places = {"student": "student", "assets": "student", "evaluation": evaluation}
     inputs = {slot: SimpleNamespace(path=folder / place, manifest=manifests[slot]) for slot, place in places.items()}
     path.mkdir()
@@ -107,6 +121,7 @@ def export(world, path: Path, monkeypatch, evaluation: str = "evaluation") -> Dr
     return draft
 
 
+@pytest.mark.slow
 def test_export_opens_verifies_and_repeats(world, tmp_path, monkeypatch):
     folder, texts, episode = world
     draft = export(world, tmp_path / "a", monkeypatch)
@@ -126,7 +141,7 @@ def test_export_opens_verifies_and_repeats(world, tmp_path, monkeypatch):
 
 
 def test_evaluations_without_episodes_will_do(world, tmp_path):
-    folder, _, episode = world
+    folder, _, _episode = world
     assert recorded_episode(SCHEMA, folder / "empty") is None
     golden = golden_observations(SCHEMA, folder / "empty", 5)
     SCHEMA.check(golden)

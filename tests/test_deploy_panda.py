@@ -87,7 +87,7 @@ def test_no_arm_is_refused_by_name(tmp_path):
 def test_a_reflex_is_refused_by_name(tmp_path):
     state = '{"t": 1e9, "q": [0,0,0,0,0,0,0], "qd": [0,0,0,0,0,0,0], "rate": 1}'
     fake = tmp_path / "python"
-    fake.write_text(f"#!/bin/sh\necho '{state}'\nread line\necho '{{\"error\": \"reflex!\", \"kind\": \"reflex\"}}'\n")
+    fake.write_text(f'#!/bin/sh\necho \'{state}\'\nread line\necho \'{{"error": "reflex!", "kind": "reflex"}}\'\n')
     fake.chmod(0o755)
     arm = PandaArm("127.0.0.1", make_contract(load_robot(), SCHEMA, DeployConfig()), fake)
     arm.command(np.zeros(7))

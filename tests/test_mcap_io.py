@@ -111,7 +111,10 @@ def test_topics_and_values(tmp_path):
 
 
 NUMBERS = st.one_of(
-    hnp.floating_dtypes(endianness="<", sizes=(32, 64)), hnp.integer_dtypes(endianness="<"), st.just(np.dtype(bool)), st.just(np.dtype("u1"))
+    hnp.floating_dtypes(endianness="<", sizes=(32, 64)),
+    hnp.integer_dtypes(endianness="<"),
+    st.just(np.dtype(bool)),
+    st.just(np.dtype("u1")),
 )
 
 
@@ -185,7 +188,10 @@ recording.disconnect()
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     printed = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "print", str(tmp_path / "a.rrd")], capture_output=True, text=True, timeout=120
+        [sys.executable, "-m", "rerun", "rrd", "print", str(tmp_path / "a.rrd")],
+        capture_output=True,
+        text=True,
+        timeout=120,
     ).stdout
     chunks = [line for line in printed.splitlines() if line.startswith("Chunk(")]
     for topic, component in {

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+from scenes_small import small_objects
 
 from wbm.scenes import parts
 from wbm.scenes.config import ObjectsConfig
 from wbm.scenes.families import FAMILIES
 from wbm.scenes.objects import ObjectSet, stack_objects
 from wbm.scenes.procedural import COLORS, draw_objects
-
-from scenes_small import small_objects
 
 
 @pytest.fixture(scope="module")

@@ -94,7 +94,10 @@ HOSTILE = {
     "nan.obj": (b"v 0 0 0\nv nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n", "not finite"),
     "far.obj": (b"v 0 0 0\nv 1e30 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n", "beyond"),
     "flat.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n", "flat"),
-    "open.obj": (trimesh.Trimesh(SOLID.vertices, SOLID.faces[:150]).export(file_type="obj").encode(), "open beyond repair"),
+    "open.obj": (
+        trimesh.Trimesh(SOLID.vertices, SOLID.faces[:150]).export(file_type="obj").encode(),
+        "open beyond repair",
+    ),
     "bomb.ply": (b"ply\nformat ascii 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n", "declares"),
     "bomb.glb": (glb({"asset": {"version": "2.0"}, "accessors": [{"count": 10**12, "type": "VEC3"}]}), "declares"),
     "many.glb": (
@@ -201,7 +204,12 @@ def test_a_folder_is_imported_and_broken_files_are_named(tmp_path):
     assert len(objects) == 4 and report["read"] == 5
     assert list(report["skipped"]) == ["broken_0.obj"]
     assert report["scaled"]["kind1/RedToy_1.stl"] == "read as millimetres"
-    assert list(objects.name) == ["kind0/RedToy_0.obj", "kind0/RedToy_2.ply", "kind1/RedToy_1.stl", "kind1/RedToy_3.glb"]
+    assert list(objects.name) == [
+        "kind0/RedToy_0.obj",
+        "kind0/RedToy_2.ply",
+        "kind1/RedToy_1.stl",
+        "kind1/RedToy_3.glb",
+    ]
     assert set(objects.noun) == {"red toy"}
     np.testing.assert_allclose(objects.half_extent[:, 2], 0.04, rtol=0.15)
     seen = []
@@ -214,7 +222,9 @@ def test_results_come_from_the_cache(tmp_path, monkeypatch):
     root = folder_with(tmp_path, bad=0)
     cfg = ObjectsConfig(source="meshes", path=str(root), count=0, workers=1)
     first, _ = sources.collect_objects(cfg, 0)
-    monkeypatch.setattr(sources, "run_isolated", lambda f, jobs, *_: iter(()) if not jobs else pytest.fail("worked again"))
+    monkeypatch.setattr(
+        sources, "run_isolated", lambda f, jobs, *_: iter(()) if not jobs else pytest.fail("worked again")
+    )
     moved = root.rename(tmp_path / "elsewhere")
     second, _ = sources.collect_objects(ObjectsConfig(source="meshes", path=str(moved), count=0), 0)
     np.testing.assert_array_equal(first.hull_vertices, second.hull_vertices)

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes_small import OBJECTS, small_objects
 from scipy.spatial.transform import Rotation
 
 from wbm.scenes import parts
@@ -12,17 +13,20 @@ from wbm.scenes.objects import centred, lowest_height, principal_boxes, stack_ob
 from wbm.scenes.parts import BOX, CAPSULE, CYLINDER, SPHERE, Part
 from wbm.scenes.procedural import draw_objects
 
-from scenes_small import OBJECTS, small_objects
-
 TYPES = (SPHERE, CAPSULE, CYLINDER, BOX)
 
 
 @st.composite
 def drawn_parts(draw):
     length = st.floats(0.005, 0.1)
-    quat = np.array([draw(st.floats(-1, 1)) for _ in range(4)]) + [1.1, 0, 0, 0]
+    quat = np.array([draw(st.floats(-1, 1)) for _ in range(4)]) + np.array([1.1, 0, 0, 0])
     pos = tuple(draw(st.floats(-0.1, 0.1)) for _ in range(3))
-    return Part(draw(st.sampled_from(TYPES)), (draw(length), draw(length), draw(length)), pos, tuple(quat / np.linalg.norm(quat)))
+    return Part(
+        draw(st.sampled_from(TYPES)),
+        (draw(length), draw(length), draw(length)),
+        pos,
+        tuple(quat / np.linalg.norm(quat)),
+    )
 
 
 @settings(max_examples=40, deadline=None)
@@ -40,7 +44,9 @@ def test_moments_of_primitives_are_those_of_their_fine_mesh(part):
 @given(st.integers(0, 10_000))
 def test_moments_of_hulls_are_trimesh_s(seed):
     rng = np.random.default_rng(seed)
-    vertices, faces = parts.convex_mesh(rng.normal(size=(int(rng.integers(5, 30)), 3)) * rng.uniform(0.01, 0.1, 3) + 0.3)
+    vertices, faces = parts.convex_mesh(
+        rng.normal(size=(int(rng.integers(5, 30)), 3)) * rng.uniform(0.01, 0.1, 3) + 0.3
+    )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     volume, centre, inertia = parts.mesh_moments(vertices, faces)
     assert mesh.is_watertight and mesh.volume > 0
@@ -57,7 +63,7 @@ def test_inside_bounds_and_mesh_agree(part, seed):
     cloud = rng.uniform(low - 0.01, high + 0.01, size=(500, 3))
     within = parts.inside(part, cloud)
     assert ((cloud[within] >= low) & (cloud[within] <= high)).all()
-    vertices, faces = parts.part_mesh(part, sections=64)
+    vertices, _ = parts.part_mesh(part, sections=64)
     assert (vertices >= low - 1e-9).all() and (vertices <= high + 1e-9).all()
     np.testing.assert_allclose(vertices.min(axis=0), low, atol=3e-3 * np.ptp(np.r_[low, high]))
     share = within.mean() * np.prod(high - low + 0.02)
@@ -115,7 +121,9 @@ def test_principal_boxes_contain_the_object():
 def test_two_boxes_are_used_where_they_save_room():
     bar = [Part(BOX, (0.1, 0.01, 0.01)), Part(BOX, (0.01, 0.1, 0.1), (0.1, 0, 0))]
     assert len(principal_boxes(bar)) == 2
-    assert len(principal_boxes(centred([Part(BOX, (0.1, 0.02, 0.01)), Part(BOX, (0.1, 0.02, 0.01), (0, 0, 0.02))]))) == 1
+    assert (
+        len(principal_boxes(centred([Part(BOX, (0.1, 0.02, 0.01)), Part(BOX, (0.1, 0.02, 0.01), (0, 0, 0.02))]))) == 1
+    )
 
 
 def test_too_many_parts_are_refused():

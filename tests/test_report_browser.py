@@ -30,7 +30,8 @@ def test_report_in_a_browser(address, tmp_path):
                         s.getBoundingClientRect().height, s.querySelectorAll('path, use').length]),
                     images: [...document.images].map(i => [i.complete, i.naturalWidth]),
                     ids: [...document.querySelectorAll('[id]')].map(e => e.id),
-                    anchors: [...document.querySelectorAll('nav a')].map(a => !!document.querySelector(a.getAttribute('href'))),
+                    anchors: [...document.querySelectorAll('nav a')].map(
+                        a => !!document.querySelector(a.getAttribute('href'))),
                     ink: getComputedStyle(document.querySelector('h1')).color,
                     paper: getComputedStyle(document.body).backgroundColor,
                     label: getComputedStyle(document.querySelector('svg text')).fill,
@@ -50,7 +51,8 @@ def test_report_in_a_browser(address, tmp_path):
                 played = page.evaluate(
                     """async () => { const results = [];
                     for (const v of document.querySelectorAll('video')) { v.muted = true; await v.play();
-                        await new Promise(r => { const t = setInterval(() => { if (v.currentTime > 0.1) { clearInterval(t); r(); } }, 20);
+                        await new Promise(r => {
+                            const t = setInterval(() => { if (v.currentTime > 0.1) { clearInterval(t); r(); } }, 20);
                                                  setTimeout(r, 5000); });
                         results.push([v.currentTime, v.videoWidth, v.error]); v.pause(); }
                     return results; }"""

@@ -79,12 +79,14 @@ def scene_with_ball(robot, tip):
     """The robot with a ball just in front of a fingertip, a wall beyond it, and a distractor away from all."""
     spec = mjcf.robot_spec()
     place = model.frame_poses(robot, robot.q_home)[tip][1]
-    for name, pos in (("target", place + [0.0, 0.0, -0.03]), ("clutter", np.array([3.0, 0, 1.0]))):
+    for name, pos in (("target", place + np.array([0.0, 0.0, -0.03])), ("clutter", np.array([3.0, 0, 1.0]))):
         body = spec.worldbody.add_body(name=name, pos=pos, gravcomp=1.0)
         body.add_freejoint()
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.025, 0, 0], mass=0.1, contype=2, conaffinity=7)
-    spec.worldbody.add_geom(name="wall", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.2, 0.2, 0.01], contype=4, conaffinity=0)
-    spec.geom("wall").pos = place + [0.0, 0.0, -0.062]
+    spec.worldbody.add_geom(
+        name="wall", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.2, 0.2, 0.01], contype=4, conaffinity=0
+    )
+    spec.geom("wall").pos = place + np.array([0.0, 0.0, -0.062])
     names = mjcf.add_contact_sensors(spec, "target", ["clutter"])
     return spec.compile(), names
 
@@ -172,11 +174,14 @@ def test_menagerie_skin_is_visual_only(monkeypatch, tmp_path):
     for prefix, folder, _, file in skin.PARTS:
         root = tmp_path / folder
         (root / "assets").mkdir(parents=True)
-        (root / "assets" / "part.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+        (root / "assets" / "part.obj").write_text(
+            "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+        )
         (root / file).write_text(
             '<mujoco><compiler meshdir="assets"/><asset><mesh name="part" file="part.obj"/>'
             '<material name="paint" rgba="1 0 0 1"/></asset><worldbody>'
-            f'<body name="{bodies[prefix]}"><geom type="mesh" mesh="part" material="paint" contype="0" conaffinity="0"/>'
+            f'<body name="{bodies[prefix]}">'
+            '<geom type="mesh" mesh="part" material="paint" contype="0" conaffinity="0"/>'
             '<geom type="mesh" mesh="part"/></body></worldbody></mujoco>'
         )
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
@@ -186,7 +191,12 @@ def test_menagerie_skin_is_visual_only(monkeypatch, tmp_path):
     assert dressed.body_mass.sum() == pytest.approx(plain.body_mass.sum())
     added = np.flatnonzero(dressed.geom_group == skin.SKIN_GROUP)
     assert not dressed.geom_contype[added].any()
-    assert {dressed.body(dressed.geom_bodyid[g]).name for g in added} == {"arm_link3", "hand_if_px", "neck_link5", "base"}
+    assert {dressed.body(dressed.geom_bodyid[g]).name for g in added} == {
+        "arm_link3",
+        "hand_if_px",
+        "neck_link5",
+        "base",
+    }
     np.testing.assert_allclose(dressed.geom_rgba[added], [[1, 0, 0, 1]] * 4)
     path = tmp_path / "out" / "robot.xml"
     export.export_robot(path, MjcfOptions(skin="menagerie"))

@@ -90,7 +90,13 @@ def test_masses_inertias_and_limits_are_the_published_ones(robot, part, prefix):
 def test_joint_order_and_groups(robot):
     assert len(robot.joint_names) == joints.NUM_JOINTS == 32
     assert robot.joint_names[:4] == ("base_x", "base_y", "base_yaw", "arm_joint1")
-    assert robot.joint_names[joints.HAND][:5] == ("hand_if_mcp", "hand_if_rot", "hand_if_pip", "hand_if_dip", "hand_mf_mcp")
+    assert robot.joint_names[joints.HAND][:5] == (
+        "hand_if_mcp",
+        "hand_if_rot",
+        "hand_if_pip",
+        "hand_if_dip",
+        "hand_mf_mcp",
+    )
     assert robot.joint_names[joints.HAND][-4:] == ("hand_th_cmc", "hand_th_axl", "hand_th_mcp", "hand_th_ipl")
     assert robot.joint_names[joints.NECK] == tuple(f"neck_joint{i}" for i in range(1, 7))
     assert len(joints.WBC) == 16

@@ -88,8 +88,15 @@ def _compare_groups(old: Path, new: Path, where: str) -> Iterator[FirstDifferenc
         if not isinstance(a, zarr.Array) or not isinstance(b, zarr.Array):
             yield FirstDifference(where, name, -1, f"only in the {'second' if a is None else 'first'}", 0)
             continue
-        step = (a.shards or a.chunks)[0] if a.shape else 1
-        rows = min(a.shape[0], b.shape[0]) if a.shape and b.shape and a.shape[1:] == b.shape[1:] else 0
+        if a.shape != b.shape and (not a.shape or not b.shape or a.shape[1:] != b.shape[1:]):
+            yield FirstDifference(where, name, -1, f"shape {a.shape} and {b.shape}", 0)
+            continue
+        if not a.shape:
+            found = _first_row(np.atleast_1d(np.asarray(a[...])), np.atleast_1d(np.asarray(b[...])))
+            if found:
+                yield FirstDifference(where, name, *found, 0)
+            continue
+        rows, step = min(a.shape[0], b.shape[0]), (a.shards or a.chunks)[0]
         for start in range(0, rows, step):
             stop = min(start + step, rows)
             found = _first_row(np.asarray(a[start:stop]), np.asarray(b[start:stop]))
@@ -98,7 +105,7 @@ def _compare_groups(old: Path, new: Path, where: str) -> Iterator[FirstDifferenc
                 break
         else:
             if a.shape != b.shape:
-                yield FirstDifference(where, name, rows if rows else -1, f"shape {a.shape} and {b.shape}", 0)
+                yield FirstDifference(where, name, rows, f"shape {a.shape} and {b.shape}", 0)
 
 
 def _compare_tensors(old: Path, new: Path, where: str) -> Iterator[FirstDifference]:

@@ -67,7 +67,7 @@ class EpisodeReader:
         for k in range(-(-self.num_steps // self._shard)):
             if f"{self.path.stem}.zarr/steps/c/{k}/0" not in index["files"]:
                 raise ValueError(f"{self.path} does not list the rows from {k * self._shard} on; make the shard again")
-        self.embeddings = np.asarray(zarr.open_group(str(root / f"{self.path.stem}.zarr"), mode="r")[TEXT_FIELD][:])
+        self.embeddings = np.asarray(zarr.open_group(str(root / f"{self.path.stem}.zarr"), mode="r")[TEXT_FIELD][:])  # pyright: ignore[reportArgumentType]
         self._files: OrderedDict[int, tuple[int, np.ndarray]] = OrderedDict()
         self._zstd = Zstd()
 

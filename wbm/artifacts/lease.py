@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from wbm.artifacts.backend import ABSENT, Backend
-from wbm.artifacts.errors import Conflict
+from wbm.artifacts.errors import ArtifactError, Conflict
 
 TERM_S = 60.0
 _ACTIVE: set[str] = set()  # nonces of the leases that this process holds
@@ -104,8 +104,8 @@ class Lease:
                 self._record = fresh
             except Conflict:
                 return  # check() reports it to the writer
-            except OSError:
-                continue  # a full or unreachable disk may recover before the term ends
+            except (ArtifactError, OSError):
+                continue  # a full disk or an unreachable server may recover before the term ends
 
     def check(self) -> None:
         """Make sure that this process is still the writer.
@@ -127,8 +127,8 @@ class Lease:
         try:
             self.check()
             self._backend.write(self._path, replace(self._record, holder=None).to_bytes(), self._version)
-        except (Conflict, OSError):
-            return  # taken over, or the disk is gone: a dead holder is recognised anyway
+        except (ArtifactError, OSError):
+            return  # taken over, or the store is out of reach: a dead holder is recognised anyway
 
 
 def acquire(backend: Backend, path: str, *, wait_s: float = 0.0) -> Lease:

@@ -140,7 +140,7 @@ def read_mcap(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def zarr_to_mcap(group: zarr.Group, path: str | Path, tracks: EpisodeTracks, steps: slice = slice(None)) -> int:
-    """Write the steps of an episode that lies in a Zarr group (arrays [T, ...]) as MCAP; returns the number of messages."""
+    """Write an episode that lies in a Zarr group (arrays [T, ...]) as MCAP; returns the number of messages."""
     arrays = {name: np.asarray(array[steps]) for name, array in sorted(group.arrays())}
     return write_mcap(path, tracks, arrays, dict(group.attrs))
 
@@ -272,13 +272,19 @@ def _cloud(stamp: Any, frame: str, xyz: np.ndarray, valid: np.ndarray, rgb: np.n
         for i, channel in enumerate(("red", "green", "blue")):
             packed[channel] = rgb[keep, i]
         packed["alpha"] = 255
+    offsets = np.cumsum([0] + [4 if k == "<f4" else 1 for _, k in kinds])
     fields = [
-        fg.PackedElementField(name=n, offset=packed.dtype.fields[n][1], type=_NUMERIC.Float32 if k == "<f4" else _NUMERIC.Uint8)
-        for n, k in kinds
+        fg.PackedElementField(name=n, offset=int(o), type=_NUMERIC.Float32 if k == "<f4" else _NUMERIC.Uint8)
+        for (n, k), o in zip(kinds, offsets, strict=False)
     ]
     pose = fg.Pose(position=fg.Vector3(), orientation=fg.Quaternion(w=1.0, x=0.0, y=0.0, z=0.0))
     return fg.PointCloud(
-        timestamp=stamp, frame_id=frame, pose=pose, point_stride=packed.dtype.itemsize, fields=fields, data=packed.tobytes()
+        timestamp=stamp,
+        frame_id=frame,
+        pose=pose,
+        point_stride=packed.dtype.itemsize,
+        fields=fields,
+        data=packed.tobytes(),
     )
 
 
@@ -287,7 +293,7 @@ def _entity(solid: Solid, stamp: Any, pos: np.ndarray, quat: np.ndarray) -> Any:
     pose = fg.Pose(position=_vector(pos), orientation=_quaternion(quat))
     r, g, b, a = (float(c) for c in solid.rgba)
     color, size = fg.Color(r=r, g=g, b=b, a=a), [float(s) for s in solid.size]
-    parts: dict[str, list[Any]] = {}
+    parts: dict[str, Any] = {}
     if solid.type == BOX:
         parts["cubes"] = [fg.CubePrimitive(pose=pose, size=_vector(2 * np.array(size)), color=color)]
     elif solid.type == SPHERE:

@@ -16,13 +16,14 @@ class WbcWeights:
     ee_position: float = 10.0
     ee_rotation: float = 2.0
     gaze: float = 0.5
-    distance: float = 0.02
+    distance: float = 0.05
     posture: float = 0.004
     posture_base: float = 0.0
     centring: float = 0.05
     base: float = 0.1
     smoothness: float = 0.3
     damping: float = 0.01
+    look: float = 1.0
     collision: float = 0.02
 
     def __post_init__(self) -> None:

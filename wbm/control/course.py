@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
 
 from wbm.control.wbc import WholeBodyController
 from wbm.robot.joints import ARM, BASE, NECK, WBC
@@ -235,8 +234,3 @@ def set_target(controller: WholeBodyController, course: Course, t: float) -> Non
     pos, quat, look = course.target(t)
     for array, value in ((controller.ee_pos, pos), (controller.ee_quat, quat), (controller.gaze_point, look)):
         array.assign(np.ascontiguousarray(value, dtype=np.float32))
-
-
-def sync(controller: WholeBodyController) -> None:
-    """Wait for the device, for timings."""
-    wp.synchronize_device(controller.device)

@@ -9,8 +9,8 @@ import warp as wp
 
 from wbm.kernels.kinematics import Tree
 from wbm.robot.facts import quat_to_mat
-from wbm.robot.joints import WBC
-from wbm.robot.model import FIXED, SLIDE, RobotModel
+from wbm.robot.joints import BASE, NECK, WBC
+from wbm.robot.model import FIXED, SLIDE, RobotModel, forward_kinematics, frame_poses
 from wbm.robot.spheres import SphereSet
 
 
@@ -29,7 +29,7 @@ class Tables:
     block: np.ndarray
     pair: np.ndarray
 
-    def upload(self, device: wp.context.Device) -> Tree:
+    def upload(self, device: wp.context.Device) -> Tree:  # pyright: ignore[reportGeneralTypeIssues]
         """The device struct of these tables."""
         tree = Tree()
         for name, value in self.tree.items():
@@ -62,7 +62,7 @@ def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray) -> Ta
     group = np.array([_group(robot, link) for link in spheres.link])
     order = np.argsort(group, kind="stable").astype(np.int32)
     names, starts = np.unique(group[order], return_index=True)
-    group_mask = np.array([_mask_of(mask, body[name]) for name in names], dtype=np.int64)
+    group_mask = np.array([_mask_of(mask, body[name]) for name in names], dtype=np.int64)  # pyright: ignore[reportArgumentType]
     block, pair = _blocks(np.asarray(pairs), group, names, order)
     group_parent, group_own, group_joint = _group_chain(group_mask)
     sphere_body = np.array([body[link] for link in spheres.link[order]], dtype=np.int32)
@@ -100,6 +100,16 @@ def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray) -> Ta
         block=block,
         pair=pair,
     )
+
+
+def neck_pan(robot: RobotModel) -> tuple[np.ndarray, float]:
+    """Place of the neck's first joint in the base frame (m), and the azimuth of the home pose's optical axis (rad)."""
+    q = robot.q_home.copy()
+    q[BASE] = 0.0
+    _, pos = forward_kinematics(robot, q)
+    joint = int(np.flatnonzero(robot.joint_index == NECK.start)[0])
+    axis = frame_poses(robot, q)["camera"][0][:, 2]
+    return pos[joint], float(np.arctan2(axis[1], axis[0]) - robot.q_home[NECK.start])
 
 
 def _bodies(robot: RobotModel):

@@ -1,5 +1,8 @@
 """The whole-body controller: 16 joint velocities a step for many environments, inside every limit."""
 
+# Warp kernels and vectors have no useful static types.
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -9,9 +12,18 @@ import numpy as np
 import warp as wp
 
 from wbm.control.config import WbcConfig
-from wbm.control.tables import build_tables
-from wbm.kernels import distance, kinematics, wbc_assemble, wbc_objectives, wbc_paper, wbc_qp
-from wbm.robot.joints import WBC
+from wbm.control.tables import build_tables, neck_pan
+from wbm.kernels import (
+    distance,
+    kinematics,
+    wbc_assemble,
+    wbc_dampers,
+    wbc_integrate,
+    wbc_objectives,
+    wbc_paper,
+    wbc_qp,
+)
+from wbm.robot.joints import NECK, WBC
 from wbm.robot.model import RobotModel
 from wbm.robot.spheres import SphereSet, robot_spheres, self_pairs
 
@@ -183,6 +195,9 @@ class WholeBodyController:
         frames = wbc_assemble.Frames()
         frames.ee, frames.camera = (self.frame_names.index(n) for n in ("ee", "camera"))
         frames.ee_mask, frames.camera_mask = (t.frame_mask[n] for n in ("ee", "camera"))
+        frames.base = self.frame_names.index("base")
+        frames.pan = int(np.flatnonzero(NECK.start == WBC)[0])
+        frames.pan_mount, frames.pan_zero = neck_pan(robot)
         self._frames = frames
 
     def _allocate_inputs(self) -> None:
@@ -234,7 +249,7 @@ class WholeBodyController:
         self._low, self._high, self._x = (a((n, joints), wp.float64) for _ in range(3))
         self._twist = a((n, groups), wp.spatial_vectord)
         self._lack, self._rate = a((n, c), wp.float64), a((n, c), wp.float64)
-        dampers = wbc_qp.Dampers()
+        dampers = wbc_dampers.Dampers()
         dampers.region_start, dampers.count, dampers.screw = self._region_start, self._count, self._screw
         dampers.force, dampers.moment, dampers.bound, dampers.side = self._force, self._moment, self._bound, self._side
         self._dampers = dampers
@@ -243,7 +258,7 @@ class WholeBodyController:
         launch()  # compiles and loads the kernels, which a capture must not do
         with wp.ScopedCapture(self.device) as capture:
             launch()
-        return capture.graph
+        return capture.graph  # pyright: ignore[reportReturnType]
 
     def _run(self, kernel: wp.Kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -260,6 +275,8 @@ class WholeBodyController:
         n, m, groups = self.num_envs, self.num_obstacles, self._num_groups
         tree, cfg = self._tree, self.cfg
         placed = [self._obstacle_rot, self._obstacle_ball, self.sphere_margin]
+        placed += [self.gains, cfg.reach, cfg.dt, self._region_start]
+        pairs = [self._block, self._pair, self.gains, cfg.reach_self, cfg.dt, self._region_start]
         found = [self._count, self._nearest, self._force, self._moment, self._gap, self._bound, self._side]
         self._run(
             kinematics.place_spheres,
@@ -276,15 +293,13 @@ class WholeBodyController:
         self._run(
             distance.obstacle_candidates,
             (n, groups),
-            [tree, self._sphere_pos, self._ball, self.obstacle_type, self.obstacle_size, *placed]
-            + [self.gains, cfg.reach, cfg.dt, self._region_start],
+            [tree, self._sphere_pos, self._ball, self.obstacle_type, self.obstacle_size, *placed],
             found,
         )
         self._run(
             distance.self_candidates,
             n,
-            [tree, self._sphere_pos, self._ball, self._block, self._pair, self.gains, cfg.reach_self, cfg.dt]
-            + [self._region_start],
+            [tree, self._sphere_pos, self._ball, *pairs],
             found,
         )
 
@@ -311,7 +326,7 @@ class WholeBodyController:
         else:
             self._launch_qp(tasks)
         self._run(
-            wbc_qp.integrate,
+            wbc_integrate.integrate,
             n,
             [self._x, self._low, self._high, self._q_from, limits.q_min, limits.q_max, limits.dt, self.cfg.lag],
             [self.qd, self.q_target, self.ctrl, self._fresh],

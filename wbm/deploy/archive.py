@@ -1,7 +1,7 @@
 """The container of a bundle: a stored (uncompressed) zip whose comment seals every byte before it.
 
-`sha256(everything before the comment)` in the comment means that a flipped bit anywhere, also in places that zip readers
-skip, is found before any member is looked at. Reading never extracts to disk.
+The SHA-256 of everything before the comment stands in the comment, so that a flipped bit anywhere, also in places that
+zip readers skip, is found before any member is looked at. Reading never extracts to disk.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def unpack(path: Path, allowed: frozenset[str]) -> dict[str, bytes]:
 
     Raises:
         FileNotFoundError: no such file.
-        BundleError: `NOT_A_BUNDLE`, `TRUNCATED`, `BUNDLE_VERSION`, `CHECKSUM`, `TOO_LARGE`, `UNSAFE_PATH` or `UNKNOWN_MEMBER`.
+        BundleError: `NOT_A_BUNDLE`, `TRUNCATED`, `BUNDLE_VERSION`, `CHECKSUM`, `TOO_LARGE`, `UNSAFE_PATH` or
+            `UNKNOWN_MEMBER`.
     """
     size = path.stat().st_size
     if size > MAX_TOTAL:

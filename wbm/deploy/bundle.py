@@ -222,7 +222,7 @@ class Bundle:
 
 
 def _can_check() -> bool:
-    """Whether signatures can be checked here; without a trusted key an unchecked one only means `signer` stays empty."""
+    """Whether signatures can be checked here; if not, and no key is asked for, `signer` stays empty."""
     try:
         import cryptography  # noqa: F401
     except ImportError:

@@ -206,7 +206,8 @@ def _check_fields(data: dict[str, Any], schema: PolicySchema) -> None:
         for key in ("dtype", "unit", "frame"):
             if stored[key] != getattr(field, key):
                 raise ValueError(
-                    f"contract.policy.observation {field.name!r} has {key} {stored[key]!r}, expected {getattr(field, key)!r}"
+                    f"contract.policy.observation {field.name!r} has {key} {stored[key]!r}, "
+                    f"expected {getattr(field, key)!r}"
                 )
 
 

@@ -58,7 +58,8 @@ class InstructionCache:
             if self.encoder is None:
                 raise Refused(
                     Fault.UNKNOWN_INSTRUCTION,
-                    f"{sentence!r} is not among the {len(self)} cached sentences; pass encoder= (docs/deploy.md) or use one of them",
+                    f"{sentence!r} is not among the {len(self)} cached sentences; "
+                    "set .encoder (docs/deploy.md) or use one of them",
                 )
             self._add(sentence, np.asarray(self.encoder([sentence]))[0])
         return self._rows[key]

@@ -1,8 +1,8 @@
 """Logs of what the robot saw, what it was told, and what was refused, as MCAP (needs the `mcap` package).
 
 While running, messages go unchunked into `NAME.partial` and reach the operating system on a timer, so a killed process
-loses at most one flush interval. Closing packs them into indexed 64 KiB chunks, syncs and renames; `recover` does the same to
-a log whose process was killed.
+loses at most one flush interval. Closing packs them into indexed 64 KiB chunks, syncs and renames; `recover` does the
+same to a log whose process was killed.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class RunLog:
         self.path = Path(path)
         self.partial = self.path.with_name(self.path.name + ".partial")
         self._flush_s = flush_s
-        self._stream = open(self.partial, "wb")
+        self._stream = open(self.partial, "wb")  # noqa: SIM115 - closed by `close`
         self._writer = Writer(self._stream, use_chunking=False, compression=CompressionType.NONE)
         self._writer.start(profile="", library="wbm")
         self._channels = {}

@@ -59,7 +59,7 @@ def run_loop(
 ) -> LoopReport:
     """Run the policy in closed loop.
 
-    A refusal never reaches the driver as a command: the driver is told to hold, and the loop goes on with the next reading.
+    A refusal never reaches the driver as a command: the driver holds, and the loop goes on with the next reading.
 
     Args:
         driver: robot or simulator.
@@ -107,10 +107,10 @@ def run_loop(
 def measure_latency(runtime: PolicyRuntime, driver: Driver, steps: int = 1000, warmup: int = 50) -> dict[str, float]:
     """Process time and wall time of `PolicyRuntime.step` on readings of a driver, without waiting between them.
 
-    Wall time is what the robot sees; process time is what the computation costs on a machine that is busy with other work.
+    Wall time is what the robot sees; process time is what the computation costs on a busy machine.
 
     Returns:
-        `cpu_p50_s`, `cpu_p99_s`, `wall_p50_s`, `wall_p99_s`, `jitter_s` (standard deviation of the wall time) and `steps`.
+        `cpu_p50_s`, `cpu_p99_s`, `wall_p50_s`, `wall_p99_s`, `jitter_s` (standard deviation of the wall time), `steps`.
     """
     runtime.reset()
     cpu, wall = np.zeros(steps), np.zeros(steps)
@@ -120,7 +120,9 @@ def measure_latency(runtime: PolicyRuntime, driver: Driver, steps: int = 1000, w
         c0, w0 = time.process_time(), time.perf_counter()
         try:
             driver.command(runtime.step(reading, now))
-        except Refused as refused:  # a robot without a plan may leave its workspace; that step was computed all the same
+        except (
+            Refused
+        ) as refused:  # a robot without a plan may leave its workspace; that step was computed all the same
             driver.hold(refused.fault.value)
             runtime.recover()
         if i >= warmup:

@@ -19,11 +19,13 @@ from wbm.deploy.faults import Fault, Refused
 from wbm.robot import joints
 
 STREAM = Path(__file__).with_name("panda_stream.py")
-FCI_QDD_MAX = 3.0  # rad/s^2: the control interface refuses 10 (and 5,000 rad/s^3), and a lost cycle multiplies what it sees
+FCI_QDD_MAX = (
+    3.0  # rad/s^2: the control interface refuses 10 (and 5,000 rad/s^3), and a lost cycle multiplies what it sees
+)
 _STALE_S = 0.1
 
-# Franka Control Interface, FR3: joint ranges (rad), and offset (rad/s) and deceleration (rad/s^2) of the rule that narrows the
-# velocity near their ends.
+# Franka Control Interface, FR3: joint ranges (rad), and offset (rad/s) and deceleration (rad/s^2) of the rule that
+# narrows the velocity near their ends.
 FR3_RANGE = np.array(
     [
         [-2.7501, 2.7501],
@@ -95,13 +97,18 @@ class PandaArm:
         self._first = threading.Event()
         self.worst_success_rate = 1.0
         self._process = subprocess.Popen(
-            [str(python), str(STREAM), host, json.dumps(limits)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [str(python), str(STREAM), host, json.dumps(limits)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         self._reader = threading.Thread(target=self._read, name="panda-states", daemon=True)
         self._reader.start()
         if not self._first.wait(timeout_s):
             self.close()
-            raise Refused(Fault.DISCONNECTED, f"no state from {host} within {timeout_s:.0f} s; is the control interface on?")
+            raise Refused(
+                Fault.DISCONNECTED, f"no state from {host} within {timeout_s:.0f} s; is the control interface on?"
+            )
         self._check()
 
     def state(self) -> ArmState:
@@ -111,7 +118,9 @@ class PandaArm:
             Refused: `REFLEX` when the arm stopped itself, `DISCONNECTED` when states no longer come.
         """
         with self._lock:
-            self._lock.wait_for(lambda: self._error or (self._state and self._state.stamp > self._given), timeout=_STALE_S)
+            self._lock.wait_for(
+                lambda: self._error or (self._state and self._state.stamp > self._given), timeout=_STALE_S
+            )
             state = self._state
         self._check()
         assert state is not None

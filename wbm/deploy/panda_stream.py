@@ -1,8 +1,8 @@
 """Streams joint targets to a Panda or FR3 at 1 kHz through libfranka; runs as a process of its own.
 
-It needs `pylibfranka` and nothing else (not even this package), so that it can live in a virtual environment of its own and
-no work in the policy's process can delay its cycle. Commands come as JSON lines on standard input, states and
-errors leave as JSON lines on standard output:
+It needs `pylibfranka` and nothing else (not even this package), so that it can live in a virtual environment of its
+own and no work in the policy's process can delay its cycle. Commands come as JSON lines on standard input, states
+and errors leave as JSON lines on standard output:
 
     in   {"q": [7]}                    target to be reached in one policy period
          {"stop": true}                come to rest and end
@@ -32,14 +32,14 @@ MAX_MISSED = 20  # cycles; the arm stops by itself when it misses more
 
 
 class Follower:
-    """One joint: follows targets that come every policy period, within position, velocity, acceleration and jerk limits.
+    """One joint: follows the targets of a policy within position, velocity, acceleration and jerk limits.
 
-    The reference runs straight to each new target. The joint's velocity is the reference's plus a gain on the gap, boxed by
-    the limits and by the velocity from which the joint can still brake; a first-order filter then bounds the jerk. The filter is a
-    weighted mean of the past, so that it cannot leave limits that its input keeps.
+    The reference runs straight to each new target. The joint's velocity is the reference's plus a gain on the gap,
+    boxed by the limits and by the velocity from which the joint can still brake; a first-order filter then bounds the
+    jerk. The filter is a weighted mean of the past, so that it cannot leave limits that its input keeps.
 
-    An FR3 also narrows the velocity near the ends of a joint's range: |v| <= sqrt(2 d x) - o at distance x from the end.
-    `envelope` is (o, d) of that rule, in rad/s and rad/s^2.
+    An FR3 also narrows the velocity near the ends of a joint's range: |v| <= sqrt(2 d x) - o at distance x from the
+    end. `envelope` is (o, d) of that rule, in rad/s and rad/s^2.
     """
 
     def __init__(
@@ -138,7 +138,8 @@ def stream(host: str, limits: dict[str, Any]) -> None:
     names = ("q_min", "q_max", "qd_max", "qdd_max")
     envelopes = limits["envelope"] or [None] * len(state.q_d)
     joints = [
-        Follower(q, *(limits[n][i] for n in names), limits["period"], envelopes[i]) for i, q in enumerate(state.q_d)
+        Follower(q, **{n: limits[n][i] for n in names}, period=limits["period"], envelope=envelopes[i])
+        for i, q in enumerate(state.q_d)
     ]
     cycle, cycles = 0, 1
     while True:

@@ -42,13 +42,15 @@ class OnnxPolicy:
             if kind != _TYPES[field.dtype] or tuple(shape[1:]) != field.shape or isinstance(shape[0], int):
                 raise BundleError(
                     Fault.ONNX_SIGNATURE,
-                    f"policy.onnx input {field.name!r} is {kind or 'missing'} {list(shape)}, expected {_TYPES[field.dtype]} ['batch', {field.shape}]",
+                    f"policy.onnx input {field.name!r} is {kind or 'missing'} {list(shape)}, "
+                    f"expected {_TYPES[field.dtype]} ['batch', {field.shape}]",
                 )
         outputs = {o.name: tuple(o.shape) for o in self._session.get_outputs()}
         if found or "action" not in outputs or outputs["action"][1:] != (schema.action.size,):
             raise BundleError(
                 Fault.ONNX_SIGNATURE,
-                f"policy.onnx has extra inputs {sorted(found)} and outputs {outputs}; expected output 'action' [batch, 32]",
+                f"policy.onnx has extra inputs {sorted(found)} and outputs {outputs}; "
+                "expected output 'action' [batch, 32]",
             )
 
     def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
@@ -60,7 +62,7 @@ class OnnxPolicy:
         """
         self.schema.check(observation)
         feed = {f.name: np.ascontiguousarray(observation[f.name], dtype=f.dtype) for f in self._fields}
-        action = self._session.run(["action"], feed)[0]
+        action = np.asarray(self._session.run(["action"], feed)[0])
         if not np.isfinite(action).all():
             raise Refused(Fault.POLICY_OUTPUT, "the network returned values that are not finite")
         return action

@@ -20,8 +20,8 @@ _HISTORY_S = 1.0
 class PolicyRuntime:
     """Steps a bundle's policy; holds the previous action, the instruction and a short history of joint readings.
 
-    Latency: each cloud is moved from the sensor's pose at the cloud's own stamp into the base frame at the joints' stamp,
-    so that a camera that moves while its frame is under way does not smear the target.
+    Latency: each cloud is moved from the sensor's pose at the cloud's own stamp into the base frame at the joints'
+    stamp, so that a camera that moves while its frame is under way does not smear the target.
 
     Args:
         bundle: an opened bundle.
@@ -66,7 +66,9 @@ class PolicyRuntime:
         """
         embedding = np.asarray(embedding, dtype=np.float32)
         if embedding.shape != (self.contract.schema.text_dim,):
-            raise Refused(Fault.WRONG_SHAPE, f"embedding has shape {embedding.shape}, expected ({self.contract.schema.text_dim},)")
+            raise Refused(
+                Fault.WRONG_SHAPE, f"embedding has shape {embedding.shape}, expected ({self.contract.schema.text_dim},)"
+            )
         if not np.isfinite(embedding).all():
             raise Refused(Fault.NOT_FINITE, "the embedding holds values that are not finite")
         self._text, self.instruction = embedding, ""

@@ -1,4 +1,4 @@
-"""Optional ed25519 signature over a bundle's checksums (needs the `cryptography` package, which the runtime does not)."""
+"""Optional ed25519 signature over a bundle's checksums (needs `cryptography`, which the runtime does not)."""
 
 from __future__ import annotations
 

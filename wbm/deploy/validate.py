@@ -1,7 +1,7 @@
 """A small validator for the part of JSON Schema (2020-12) that the contract uses, so that the runtime needs no package.
 
 Keywords: `type`, `const`, `enum`, `properties`, `required`, `additionalProperties` (bool or schema), `items`,
-`minItems`, `maxItems`, `minLength`, `minimum`, `maximum`, `exclusiveMinimum`. An unknown keyword is an error of the schema.
+`minItems`, `maxItems`, `minLength`, `minimum`, `maximum`, `exclusiveMinimum`. An unknown keyword is an error.
 """
 
 from __future__ import annotations

@@ -27,7 +27,8 @@ EE_LABELS = tuple(f"ee_{kind}_{axis}" for kind in ("move", "turn") for axis in "
 class HandAction:
     """Incremental hand joint targets, kept near the joints so that the grip force stays bounded.
 
-    `mix`: target += step * a_joint + closure * (closure_step * a_common + finger_step * a_finger), where `closure` is the
+    `mix`: target += step * a_joint + closure * (closure_step * a_common + finger_step * a_finger), where `closure`
+    is the
     direction from the open to the closed hand, scaled to a largest entry of 1.
     """
 
@@ -79,7 +80,9 @@ class WbcAction:
         self.velocity = torch.zeros(num_envs, 3, device=device)
 
     def reset(self, ids: Tensor, q: Tensor, ee_pos: Tensor, ee_quat: Tensor) -> None:
-        """Put the targets of environments `ids` onto the present state (`q` [K,32], `ee_pos` [K,3], `ee_quat` [K,4])."""
+        """Put the targets of environments `ids` onto the present state (`q` [K,32], `ee_pos` [K,3], `ee_quat`
+        [K,4]).
+        """
         self.hand.reset(ids, q)
         self.pos[ids], self.quat[ids] = ee_pos, ee_quat
 

@@ -26,7 +26,8 @@ class SceneTable:
         ceiling_height: height of what is above it [S], m; inf where nothing is.
         base: base x, y, yaw from which the target is in reach [S,3].
         q_start: collision-free joint positions away from the support [S,32].
-        obstacle_type, obstacle_size, obstacle_pos, obstacle_quat: the controller's obstacles [S,M,...]; the target's own
+        obstacle_type, obstacle_size, obstacle_pos, obstacle_quat: the controller's obstacles [S,M,...]; the
+        target's own
             boxes are unused.
     """
 

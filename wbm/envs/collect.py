@@ -15,11 +15,22 @@ from wbm.envs.episodes import Frame, Record
 from wbm.envs.rollout_config import NoiseConfig
 from wbm.robot import joints
 
-_OBSERVED = ("depth_xyz", "depth_rgb", "depth_valid", "depth_target", "lidar_xyz", "lidar_valid", "proprio", "prev_action")
+_OBSERVED = (
+    "depth_xyz",
+    "depth_rgb",
+    "depth_valid",
+    "depth_target",
+    "lidar_xyz",
+    "lidar_valid",
+    "proprio",
+    "prev_action",
+)
 
 
 def injected_noise(cfg: NoiseConfig, seed: int) -> Callable[[np.ndarray, int], np.ndarray]:
-    """A function (episodes [K], steps T) -> noise [K,T,32] on joint targets; each row depends on (seed, episode) alone."""
+    """A function (episodes [K], steps T) -> noise [K,T,32] on joint targets; each row depends on (seed,
+    episode) alone.
+    """
     scale = np.zeros(joints.NUM_JOINTS)
     for value, group in zip(cfg.scale, (joints.BASE, joints.ARM, joints.HAND, joints.NECK), strict=True):
         scale[group] = value

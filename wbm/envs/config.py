@@ -58,7 +58,7 @@ class RewardConfig:
 
     Attributes:
         reach, contact, grasp, lift, stable, col, act, smooth: weights of the eight terms.
-        drop: subtracted once when a lifted object falls or an episode ends in a forbidden contact.
+        drop: subtracted once when an episode ends early: dropped, out of reach or in a forbidden contact.
         scale: common factor, 1/step.
         reach_length: decay of the reaching term, m.
         enclose: share of the enclosing shape beside the contact pattern in the grasp term.
@@ -80,7 +80,7 @@ class RewardConfig:
     col: float = 1.0
     act: float = 0.005
     smooth: float = 0.01
-    drop: float = 5.0
+    drop: float = 50.0
     scale: float = 0.02
     reach_length: float = 0.10
     enclose: float = 0.5
@@ -128,7 +128,6 @@ class RandomizationConfig:
         start_tilt: pre-grasp rotation about the grasp frame's x and y, rad.
         start_yaw: pre-grasp rotation about the approach direction, rad.
         start_hand: offset of each hand joint at the start, rad.
-        start_arm: offset of each arm joint at the start of whole-body episodes, rad.
         scene: draw the scene record at random (geometry, pose, support height, clutter); else in order.
     """
 
@@ -141,7 +140,6 @@ class RandomizationConfig:
     start_tilt: Range = field(default_factory=lambda: Range(-0.15, 0.15))
     start_yaw: Range = field(default_factory=lambda: Range(-0.5, 0.5))
     start_hand: Range = field(default_factory=lambda: Range(-0.08, 0.08))
-    start_arm: Range = field(default_factory=lambda: Range(-0.1, 0.1))
     scene: bool = True
 
 
@@ -163,6 +161,8 @@ class EnvConfig:
         standoff: distance from the object's surface to the grasp frame at the pre-grasp, m.
         reach_radius: the object is out of reach beyond this horizontal distance from its settled place, m.
         drop_height: a lifted object below this height that is not held has been dropped, m.
+        hand_margin: added to the controller's safety distance of the hand while it works, m; negative lets it touch.
+        contact_base: the controller's weight on the base's motion while the hand works.
         max_hand_force: hand force on supports or distractors that is a forbidden collision, N.
         fall_height: the object is out of reach this far below its settled height, m.
         finish_s: end the episode with success after holding this long in a row, s; 0 plays every episode to its end.
@@ -184,6 +184,8 @@ class EnvConfig:
     standoff: float = 0.06
     reach_radius: float = 0.35
     drop_height: float = 0.03
+    hand_margin: float = -0.025
+    contact_base: float = 1.0
     max_hand_force: float = 60.0
     fall_height: float = 0.10
     finish_s: float = 0.0

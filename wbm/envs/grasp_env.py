@@ -15,7 +15,7 @@ from wbm.envs.binding import SceneBinding
 from wbm.envs.config import EnvConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.observations import TeacherObservation
-from wbm.envs.outcome import RUNNING, TIMEOUT, UNSTABLE, Outcome
+from wbm.envs.outcome import RUNNING, SUCCESS, UNSTABLE, Outcome
 from wbm.envs.pregrasp import StartBank
 from wbm.envs.randomization import Randomizer
 from wbm.envs.sensing import StateReader
@@ -152,7 +152,9 @@ class GraspEnv:
         hand = self.cfg.randomization.start_hand
         if hand.on:
             q[:, joints.HAND] += hand.low + (hand.high - hand.low) * u[:, self._hand]
-            q[:, joints.HAND] = torch.maximum(torch.minimum(q[:, joints.HAND], self.action.hand.high), self.action.hand.low)
+            q[:, joints.HAND] = torch.maximum(
+                torch.minimum(q[:, joints.HAND], self.action.hand.high), self.action.hand.low
+            )
         self.episode[ids] = torch.from_numpy(episodes).to(self.device)
         self.scene[ids], self.elapsed[ids] = scenes, 0
         self._load_physics(ids, u, scenes)
@@ -164,7 +166,8 @@ class GraspEnv:
         self.reader.begin(ids, scenes)
         self._obstacles(ids, scenes)
         self.posture[ids] = q[:, self._body]
-        self.controller.reset(ids)
+        self.controller.reset(ids)  # pyright: ignore[reportArgumentType]
+        self.min_distance[ids] = 1.0  # the last episode's must not be observed
         self.outcome.reset(ids)
         self.previous[ids] = 0.0
         self.q_in.copy_(self.sim.qpos[:, : joints.NUM_JOINTS])
@@ -192,7 +195,8 @@ class GraspEnv:
         Returns:
             The observation [N,O] (of the next episode where one ended), rewards [N], done flags [N] and a dictionary:
             `time_outs` [N] (ended by time alone), `outcome` [N] (see `outcome.REASONS`, `RUNNING` where it goes on),
-            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step belonged to,
+            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step
+            belonged to,
             `ctrl` [N,32] clean joint targets, and `ended`, what the step led to before any restart: `held`, `height`,
             `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
         """
@@ -214,6 +218,9 @@ class GraspEnv:
         if self.cfg.action.term == "joint":
             self.ctrl[:, self._body] = term.target
             return
+        contact = (self.phase == 1).unsqueeze(1)
+        self.margin.copy_(torch.where(contact, self._contact_margin, 0.0))
+        self.base_weight.copy_(torch.where(contact[:, 0], self.cfg.contact_base, self._free_base))
         self.ee_velocity.copy_(term.velocity)
         self.ee_target.copy_(term.pos)
         self.ee_target_quat.copy_(term.quat)
@@ -227,14 +234,15 @@ class GraspEnv:
         self.sim.ctrl.copy_(self.ctrl if self.noise is None else self.ctrl + self.noise)
         self.sim.step(self.decimation)
         self.elapsed += 1
-        self._refresh()
-        reward, terms = rewards.total(self.state, action, self.previous, self.cfg.reward)
+        before = self.previous.clone()
         self.previous.copy_(action)
+        self._refresh()
+        reward, terms = rewards.total(self.state, action, before, self.cfg.reward)
         time_up = self._time_up()
         code = self.outcome.update(self.state, self.reader.start_pos, time_up)
         done = code != RUNNING
         timed = done & time_up
-        reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed)
+        reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed & (code != SUCCESS))
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
         info |= {"ctrl": self.ctrl.clone(), "ended": self._ended()}
@@ -271,6 +279,11 @@ class GraspEnv:
         self.gaze, self.posture = wp.to_torch(c.gaze_point), wp.to_torch(c.q_posture)
         self.frame_pos, self.frame_quat = wp.to_torch(c.frame_pos), wp.to_torch(c.frame_quat)
         self.min_distance = wp.to_torch(c.min_distance)
+        # In contact the fingers work beside the support, and a base that creeps would meet it.
+        self.margin = wp.to_torch(c.sphere_margin)
+        hand = torch.tensor([n.startswith("hand_") for n in c.spheres.names], device=self.device)
+        self._contact_margin, self._free_base = hand * self.cfg.hand_margin, c.cfg.weights.base
+        self.base_weight = wp.to_torch(c.weights)[:, list(c.weight_names).index("base")]
         self.obstacles = tuple(
             wp.to_torch(a) for a in (c.obstacle_type, c.obstacle_size, c.obstacle_pos, c.obstacle_quat)
         )

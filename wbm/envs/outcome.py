@@ -35,7 +35,8 @@ class Outcome:
     def update(self, s: GraspState, start_pos_w: Tensor, time_up: Tensor) -> Tensor:
         """Judge one step; returns `code` [N], `RUNNING` where the episode goes on.
 
-        Success is a lift of at least `success_height`, held in contact for at least `success_hold_s`, without a forbidden
+        Success is a lift of at least `success_height`, held in contact for at least `success_hold_s`, without a
+        forbidden
         contact, and still held when the episode ends.
 
         Args:

@@ -85,7 +85,13 @@ class Perception:
             cloud.reset(env_ids)
 
     def observe(
-        self, q: Tensor, qd: Tensor, object_pose: Tensor, previous_action: Tensor, step: Tensor, ids: Tensor | None = None
+        self,
+        q: Tensor,
+        qd: Tensor,
+        object_pose: Tensor,
+        previous_action: Tensor,
+        step: Tensor,
+        ids: Tensor | None = None,
     ) -> Sight:
         """Render and assemble.
 

@@ -172,7 +172,7 @@ class _Solver:
         self.quat.copy_(quat[pad])
         self.gaze.copy_(t.target_pos[scenes[pad]])
         self.posture.copy_(self.q[:, self.body])
-        self.controller.reset(torch.arange(self.batch, device=scenes.device))
+        self.controller.reset(torch.arange(self.batch, device=scenes.device))  # pyright: ignore[reportArgumentType]
         for _ in range(iterations):
             self.controller.step()
             self.q[:, self.body] = self.q_target

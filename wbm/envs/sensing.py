@@ -125,7 +125,9 @@ class StateReader:
     def _relative_motion(
         self, ee_pos: Tensor, ee_quat: Tensor, ee_mat: Tensor, obj_pos: Tensor, obj_quat: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Speed (m/s) and spin (rad/s) [N] of the object in the grasp frame since the last read; 0 at an episode's start."""
+        """Speed (m/s) and spin (rad/s) [N] of the object in the grasp frame since the last read; 0 at an
+        episode's start.
+        """
         pos = ((obj_pos - ee_pos).unsqueeze(1) @ ee_mat).squeeze(1)
         quat = quat_mul(quat_conj(ee_quat), obj_quat)
         slip = (pos - self._last_pos).norm(dim=-1) / self.period

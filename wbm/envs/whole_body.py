@@ -1,4 +1,4 @@
-"""The whole-body episode: from a start pose away from the support, through free space to a pre-grasp, then the grasp."""
+"""The whole-body episode: from a start pose through free space to a pre-grasp, then the grasp."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ NEAR_PREGRASP = (0.02, 0.15)
 
 
 class WholeBodyEnv(GraspEnv):
-    """`GraspEnv` whose episodes start far away: the controller brings the hand to a pre-grasp, then the policy takes over.
+    """`GraspEnv` whose episodes start far away: the controller brings the hand to a pre-grasp, then the policy
+    takes over.
 
-    In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed in the
-    world (a target that followed the base would make the controller chase itself), and the posture is the pre-grasp's. A
+    In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed
+    in the
+    world (a target that followed the base would make the controller chase itself), and the posture is the
+    pre-grasp's. A
     teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves through both phases alike.
     """
 
@@ -122,5 +125,3 @@ def _towards(start: Tensor, goal: Tensor, step: float) -> Tensor:
     """Points [N,3] at most `step` from `start` on the way to `goal`."""
     delta = goal - start
     return start + delta * (step / delta.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
-
-

@@ -2,8 +2,8 @@
 
 Geometry types are MuJoCo's numbers and half sizes: plane 0, sphere 2, capsule 3, cylinder 5, box 6. All positions are
 relative to a reference point near the robot. A pair that is nearer than the reach becomes a candidate: the unit normal
-`n` (from the obstacle to the sphere), its moment `(p - ref) x n`, the gap to the safety distance, and the damper's bound
-on the gap's speed. `n^T p_dot = sum_j (w_j . moment + m_j . n) qd_j` then needs no Jacobian of the point itself.
+`n` (from the obstacle to the sphere), its moment `(p - ref) x n`, the gap to the safety distance, and the bound
+on its speed. `n^T p_dot = sum_j (w_j . moment + m_j . n) qd_j` then needs no Jacobian of the point itself.
 """
 
 # ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)

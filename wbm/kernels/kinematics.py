@@ -6,7 +6,7 @@ that this holds). Fixed links are folded into offsets. The controlled joints' mo
 point near the robot, which keeps float32 exact to a micrometre wherever the robot stands.
 """
 
-# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3

@@ -9,189 +9,8 @@ its hit (`trace_rays`). Geometry types and sizes use MuJoCo's numbers. Distances
 # ruff: noqa: RUF046, SIM109, UP018 (int(0) declares a dynamic variable in a Warp kernel; `in` is not compiled)
 import warp as wp
 
+from wbm.kernels.rays_shapes import BOX, CYLINDER, MESH, PLANE, UNBOUNDED, bounding_radius, is_inside, ray_instance
 from wbm.kernels.se3 import quat_wxyz_normalize, quat_wxyz_to_mat
-
-PLANE = wp.constant(0)
-SPHERE = wp.constant(2)
-CAPSULE = wp.constant(3)
-CYLINDER = wp.constant(5)
-BOX = wp.constant(6)
-MESH = wp.constant(7)
-
-MISS = wp.constant(1.0e30)
-UNBOUNDED = wp.constant(1.0e12)
-
-
-@wp.func
-def ray_plane(o: wp.vec3, d: wp.vec3, size: wp.vec3) -> float:
-    """Front side of z = 0, bounded to `|x| <= size.x`, `|y| <= size.y` where those are positive."""
-    if d[2] > -1.0e-9 or o[2] < 0.0:
-        return MISS
-    t = -o[2] / d[2]
-    if size[0] > 0.0 and wp.abs(o[0] + t * d[0]) > size[0]:
-        return MISS
-    if size[1] > 0.0 and wp.abs(o[1] + t * d[1]) > size[1]:
-        return MISS
-    return t
-
-
-@wp.func
-def ray_sphere(o: wp.vec3, d: wp.vec3, radius: float) -> float:
-    """Sphere about the origin; the discriminant is taken at the closest approach, where float32 loses nothing."""
-    t_mid = -wp.dot(o, d)
-    q = o + t_mid * d
-    h = radius * radius - wp.dot(q, q)
-    if h < 0.0:
-        return MISS
-    h = wp.sqrt(h)
-    t = t_mid - h
-    if t < 0.0:
-        t = t_mid + h
-    if t < 0.0:
-        return MISS
-    return t
-
-
-@wp.func
-def ray_capsule(o: wp.vec3, d: wp.vec3, radius: float, half: float) -> float:
-    """Capsule along z: the first point outward of its cylinder wall and its two caps."""
-    a = d[0] * d[0] + d[1] * d[1]
-    t_side = MISS
-    if a > 1.0e-12:
-        t_mid = -(o[0] * d[0] + o[1] * d[1]) / a
-        x = o[0] + t_mid * d[0]
-        y = o[1] + t_mid * d[1]
-        h = radius * radius - x * x - y * y
-        if h < 0.0:
-            return MISS
-        h = wp.sqrt(h / a)
-        t = t_mid - h
-        if t >= 0.0 and wp.abs(o[2] + t * d[2]) <= half:
-            return t
-        t = t_mid + h
-        if t >= 0.0 and wp.abs(o[2] + t * d[2]) <= half:
-            t_side = t
-    # A cap counts only outside the wall's span, where it is the surface.
-    t_cap = MISS
-    for side in range(2):
-        z = half * (2.0 * float(side) - 1.0)
-        s = z / wp.max(half, 1.0e-9)
-        oc = wp.vec3(o[0], o[1], o[2] - z)
-        t_mid = -wp.dot(oc, d)
-        q = oc + t_mid * d
-        h = radius * radius - wp.dot(q, q)
-        if h >= 0.0:
-            h = wp.sqrt(h)
-            t = t_mid - h
-            if t >= 0.0 and s * (oc[2] + t * d[2]) >= 0.0:
-                t_cap = wp.min(t_cap, t)
-            t = t_mid + h
-            if t >= 0.0 and s * (oc[2] + t * d[2]) >= 0.0:
-                t_cap = wp.min(t_cap, t)
-    return wp.min(t_side, t_cap)
-
-
-@wp.func
-def ray_cylinder(o: wp.vec3, d: wp.vec3, radius: float, half: float) -> float:
-    """Cylinder along z: the interval inside the wall cut with the interval between the ends."""
-    t0 = -MISS
-    t1 = MISS
-    a = d[0] * d[0] + d[1] * d[1]
-    if a > 1.0e-12:
-        t_mid = -(o[0] * d[0] + o[1] * d[1]) / a
-        x = o[0] + t_mid * d[0]
-        y = o[1] + t_mid * d[1]
-        h = radius * radius - x * x - y * y
-        if h < 0.0:
-            return MISS
-        h = wp.sqrt(h / a)
-        t0 = t_mid - h
-        t1 = t_mid + h
-    elif o[0] * o[0] + o[1] * o[1] > radius * radius:
-        return MISS
-    if wp.abs(d[2]) > 1.0e-12:
-        mid = -o[2] / d[2]
-        ext = wp.abs(half / d[2])
-        t0 = wp.max(t0, mid - ext)
-        t1 = wp.min(t1, mid + ext)
-    elif wp.abs(o[2]) > half:
-        return MISS
-    if t0 > t1 or t1 < 0.0:
-        return MISS
-    if t0 < 0.0:
-        return t1
-    return t0
-
-
-@wp.func
-def ray_box(o: wp.vec3, d: wp.vec3, size: wp.vec3) -> float:
-    """Box by slabs; a direction component of zero gives infinite slab ends of the right sign."""
-    t0 = -MISS
-    t1 = MISS
-    for i in range(3):
-        if wp.abs(d[i]) > 1.0e-12:
-            inv = 1.0 / d[i]
-            mid = -o[i] * inv
-            ext = wp.abs(size[i] * inv)
-            t0 = wp.max(t0, mid - ext)
-            t1 = wp.min(t1, mid + ext)
-        elif wp.abs(o[i]) > size[i]:
-            t1 = -MISS
-    if t0 > t1 or t1 < 0.0:
-        return MISS
-    if t0 < 0.0:
-        return t1
-    return t0
-
-
-@wp.func
-def ray_instance(kind: int, o: wp.vec3, d: wp.vec3, size: wp.vec3, mesh: wp.uint64, limit: float) -> float:
-    """Range to one instance in its own frame, `MISS` if there is none; meshes are searched up to `limit`."""
-    if kind == BOX:
-        return ray_box(o, d, size)
-    if kind == CAPSULE:
-        return ray_capsule(o, d, size[0], size[1])
-    if kind == PLANE:
-        return ray_plane(o, d, size)
-    if kind == CYLINDER:
-        return ray_cylinder(o, d, size[0], size[1])
-    if kind == SPHERE:
-        return ray_sphere(o, d, size[0])
-    query = wp.mesh_query_ray(mesh, o, d, limit)
-    if query.result:
-        return query.t
-    return MISS
-
-
-@wp.func
-def bounding_radius(kind: int, size: wp.vec3) -> float:
-    """Radius about the geometry's own origin that encloses a primitive."""
-    if kind == SPHERE:
-        return size[0]
-    if kind == CAPSULE:
-        return size[0] + size[1]
-    if kind == CYLINDER:
-        return wp.sqrt(size[0] * size[0] + size[1] * size[1])
-    if kind == BOX:
-        return wp.length(size)
-    return UNBOUNDED
-
-
-@wp.func
-def is_inside(kind: int, o: wp.vec3, size: wp.vec3, mesh: wp.uint64, mesh_radius: float) -> bool:
-    """Whether a point in the instance's frame lies strictly inside it (below it, for a plane)."""
-    if kind == PLANE:
-        return o[2] < 0.0
-    if kind == SPHERE:
-        return wp.length(o) < size[0]
-    if kind == CAPSULE:
-        return wp.length(wp.vec3(o[0], o[1], o[2] - wp.clamp(o[2], -size[1], size[1]))) < size[0]
-    if kind == CYLINDER:
-        return o[0] * o[0] + o[1] * o[1] < size[0] * size[0] and wp.abs(o[2]) < size[1]
-    if kind == BOX:
-        return wp.abs(o[0]) < size[0] and wp.abs(o[1]) < size[1] and wp.abs(o[2]) < size[2]
-    query = wp.mesh_query_point_sign_winding_number(mesh, o, 2.0 * mesh_radius)
-    return query.result and query.sign < 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -292,12 +111,12 @@ def place_instances(
 
 @wp.func
 def is_leaving(kind: int, o: wp.vec3, size: wp.vec3, axis: wp.vec3, cos_half: float, sin_half: float) -> bool:
-    """Whether a face's outer half space holds the origin and every ray of a cone leads further out; instance frame.
+    """Whether a flat face's outer half space holds the origin and every ray of a cone leads further out.
+
+    For a box, a plane and the ends of a cylinder, in the instance's frame.
 
     The least component of a cone's directions along a face normal n is `cos(angle(axis, n) + half)`.
     """
-    if kind == CAPSULE or kind == SPHERE or kind == MESH:
-        return False
     for i in range(3):
         extent = size[i]
         if kind == PLANE:
@@ -361,8 +180,12 @@ def cull_bundles(
             s = int(group_scratch[env, h, m])
             key = near[env, s]
             if key <= 0.0 or cones_meet(slot_cone[env, s], c4[3], axis):
-                ahead = rot[env, s] * axis
-                if c4[3] < 0.0 or not is_leaving(kind[env, s], origin[env, s], size[env, s], ahead, c4[3], sin_half):
+                leaving = bool(False)
+                shape = kind[env, s]
+                if c4[3] > 0.0 and (shape == BOX or shape == PLANE or shape == CYLINDER):
+                    ahead = rot[env, s] * axis
+                    leaving = is_leaving(shape, origin[env, s], size[env, s], ahead, c4[3], sin_half)
+                if not leaving:
                     j = int(num)
                     while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
                         cand_out[env, g, j] = cand_out[env, g, j - 1]
@@ -409,7 +232,8 @@ def trace_rays(
     for k in range(first, end):
         best_scratch[env, k] = max_range
         inst_scratch[env, k] = -1
-    # An instance's data is loaded once for all rays of the thread; it may stop when all hits lie before the next one.
+    # A sphere is loaded once for all rays of the thread, which stops when all its hits lie before the next sphere. The
+    # rest of an instance's data is left in memory until a ray meets its sphere.
     farthest = float(max_range)
     for j in range(cand_count[env, g]):
         s = int(cand[env, g, j])
@@ -418,12 +242,6 @@ def trace_rays(
             break
         s4 = sphere[env, s]
         centre = wp.vec3(s4[0], s4[1], s4[2])
-        inst = slot_inst[env, s]
-        shape = kind[env, s]
-        R_IS = rot[env, s]
-        o = origin[env, s]
-        extent = size[env, s]
-        mesh_id = mesh[env, s]
         farthest = float(0.0)
         for k in range(first, end):
             best = best_scratch[env, k]
@@ -431,11 +249,11 @@ def trace_rays(
                 d = direction[row, k]
                 along = wp.dot(centre, d)
                 if s4[3] <= 0.0 or (along > 0.0 and along * along >= s4[3]):
-                    t = ray_instance(shape, o, R_IS * d, extent, mesh_id, best)
+                    t = ray_instance(kind[env, s], origin[env, s], rot[env, s] * d, size[env, s], mesh[env, s], best)
                     if t < best:
                         best = t
                         best_scratch[env, k] = t
-                        inst_scratch[env, k] = inst
+                        inst_scratch[env, k] = slot_inst[env, s]
             farthest = wp.max(farthest, best)
     for k in range(first, end):
         out = order[row, k]

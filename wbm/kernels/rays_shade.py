@@ -3,7 +3,7 @@
 # ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
-from wbm.kernels.rays import BOX, CAPSULE, CYLINDER, MESH, PLANE, SPHERE, ray_instance
+from wbm.kernels.rays_shapes import BOX, CAPSULE, CYLINDER, MESH, PLANE, SPHERE, ray_instance
 from wbm.kernels.se3 import quat_wxyz_normalize, quat_wxyz_to_mat
 
 CHECKER = wp.constant(0.5)  # side of the floor's squares, m

@@ -4,9 +4,10 @@ min 1/2 sum_r w_r (J_r qd - v_r)^2 + 1/2 sum_i (h_i qd_i^2 - 2 g_i qd_i) + 1/2 r
 subject to low <= qd <= high, A_k qd + s_k >= b_k, s_k >= 0
 """
 
-# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
+from wbm.kernels import se3
 from wbm.kernels import wbc_objectives as obj
 from wbm.kernels.kinematics import Tree, finite_or
 from wbm.kernels.wbc_limits import velocity_bounds
@@ -52,6 +53,10 @@ class Frames:
     ee_mask: wp.int32
     camera: wp.int32
     camera_mask: wp.int32
+    base: wp.int32
+    pan: wp.int32  # controlled joint that turns the camera's arm about the vertical
+    pan_mount: wp.vec3  # its place in the base frame, m
+    pan_zero: wp.float32  # azimuth of the optical axis at pan 0 in the home pose, rad
 
 
 @wp.func
@@ -140,7 +145,11 @@ def assemble_tasks(
         jac_out[e, obj.ROW_GAZE, j] = on_cam * rows[0]
         jac_out[e, obj.ROW_GAZE + 1, j] = on_cam * rows[1]
         jac_out[e, obj.ROW_DISTANCE, j] = -on_cam * wp.dot(sight, v_cam)
-    joint_diagonal(e, targets, limits, q, qd_prev, diag_out, rhs_out)
+    look = wp.min(theta / obj.LOOK_ANGLE, 1.0)
+    look = wp.min(w_gaze, 1.0) * look * look * targets.weights[e, obj.W_LOOK]
+    target_b = se3.pose_inv_mul_pos(frame_pos[e, frames.base], frame_quat[e, frames.base], p_cam + to_target)
+    pan = obj.look_pan(target_b, frames.pan_mount, frames.pan_zero)
+    joint_diagonal(e, frames, targets, limits, q, qd_prev, look, pan, diag_out, rhs_out)
 
 
 @wp.func
@@ -156,14 +165,17 @@ def se3_axis(quat: wp.vec4, k: int) -> wp.vec3:
 @wp.func
 def joint_diagonal(
     e: int,
+    frames: Frames,
     targets: Targets,
     limits: Limits,
     q: wp.array2d(dtype=wp.float32),
     qd_prev: wp.array2d(dtype=wp.float32),
+    look: float,
+    pan: float,
     diag_out: wp.array2d(dtype=wp.float32),
     rhs_out: wp.array2d(dtype=wp.float32),
 ):
-    """Posture, centring, base weight, base smoothness and damping: `h_i qd_i^2 - 2 g_i qd_i` for each joint."""
+    """`h_i qd_i^2 - 2 g_i qd_i` of each joint: posture, facing the target, centring, base weight and smoothness."""
     for j in range(qd_prev.shape[1]):
         lever = limits.base_scale[j]
         q_j = finite_or(q[e, limits.joint[j]], 0.0)
@@ -180,6 +192,16 @@ def joint_diagonal(
             weight = wp.abs(inward) * targets.weights[e, obj.W_CENTRING]
             h += weight
             g += weight * targets.gains[e, obj.K_CENTRING] * inward
+        if lever == 0.0 and moved(frames.camera_mask, j) == 1.0:
+            goal = targets.q_posture[e, j]
+            if j == frames.pan:
+                goal = wp.clamp(pan, limits.q_min[j], limits.q_max[j])
+            weight = look
+            if j != frames.pan:
+                # Once the pan is right the other joints are free to tilt the camera as the gaze rows ask.
+                weight *= wp.clamp(2.0 * wp.abs(pan - q[e, limits.joint[frames.pan]]), 0.1, 1.0)
+            h += weight
+            g += weight * wp.clamp(2.0 * finite_or(goal - q_j, 0.0), -obj.LOOK_SPEED, obj.LOOK_SPEED)
         h += posture
         g += posture * obj.posture_velocity(targets.q_posture[e, j], q_j, targets.gains[e, obj.K_POSTURE])
         diag_out[e, j] = h

@@ -4,7 +4,7 @@ Rows 0-2 are the hand's linear velocity, 3-5 its angular velocity, 6-7 the gaze,
 joint-limit centring, base weight, base smoothness and damping act on single joints and are a diagonal.
 """
 
-# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3
@@ -19,7 +19,7 @@ ROW_DISTANCE = wp.constant(8)
 # Columns of the live arrays `weights` and `gains`, one row an environment.
 WEIGHT_NAMES = (
     "ee_position", "ee_rotation", "gaze", "distance", "posture", "posture_base",
-    "centring", "base", "smoothness", "damping", "collision",
+    "centring", "base", "smoothness", "damping", "look", "collision",
 )  # fmt: skip
 GAIN_NAMES = (
     "ee_position", "ee_rotation", "gaze", "distance", "posture", "centring", "ee_speed", "ee_turn", "gaze_turn",
@@ -28,7 +28,7 @@ GAIN_NAMES = (
 )  # fmt: skip
 (
     W_EE_POSITION, W_EE_ROTATION, W_GAZE, W_DISTANCE, W_POSTURE, W_POSTURE_BASE,
-    W_CENTRING, W_BASE, W_SMOOTHNESS, W_DAMPING, W_COLLISION,
+    W_CENTRING, W_BASE, W_SMOOTHNESS, W_DAMPING, W_LOOK, W_COLLISION,
 ) = (wp.constant(i) for i in range(len(WEIGHT_NAMES)))  # fmt: skip
 (
     K_EE_POSITION, K_EE_ROTATION, K_GAZE, K_DISTANCE, K_POSTURE, K_CENTRING, K_EE_SPEED, K_EE_TURN, K_GAZE_TURN,
@@ -40,6 +40,8 @@ HUGE = wp.constant(1.0e6)
 POSTURE_SPEED = wp.constant(0.5)
 NEAR_CAMERA = wp.constant(0.05)
 CENTRING_BAND = wp.constant(0.1)
+LOOK_ANGLE = wp.constant(0.5)  # rad, gaze error from which the neck's posture has its full weight
+LOOK_SPEED = wp.constant(1.5)  # rad/s
 AZIMUTH_FACTOR_MAX = wp.constant(1.5707964)
 
 
@@ -123,6 +125,17 @@ def distance_velocity(distance: float, nearest: float, farthest: float, gain: fl
 def posture_velocity(q_posture: float, q: float, gain: float) -> float:
     """`qd* = sat(k (q_posture - q), 0.5)`, against the joint itself."""
     return wp.clamp(gain * finite_or(q_posture - q, 0.0), -POSTURE_SPEED, POSTURE_SPEED)
+
+
+@wp.func
+def look_pan(target_b: wp.vec3, mount_b: wp.vec3, zero: float) -> float:
+    """Pan angle (rad, -pi..pi) at which the neck's posture faces a point; all in the base frame.
+
+    The gaze rows alone take the shortest turn, which can end at a joint limit with the target out of sight. In joint
+    space the pan's whole range is open, so a posture that faces the target leads out of every such corner.
+    """
+    angle = wp.atan2(target_b[1] - mount_b[1], target_b[0] - mount_b[0]) - zero
+    return wp.atan2(wp.sin(angle), wp.cos(angle))
 
 
 @wp.func

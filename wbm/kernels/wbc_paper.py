@@ -10,13 +10,14 @@ turns the camera towards the target. (4) needs a floor on d to be run at all. Wh
 the velocity and position limits, as a low-level controller would; nothing limits its change.
 """
 
-# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import wbc_objectives as obj
 from wbm.kernels.kinematics import Tree, finite_or
 from wbm.kernels.wbc_assemble import Frames, Limits, Targets, moved, se3_axis
-from wbm.kernels.wbc_qp import cholesky_solve, damper_entry, task_hessian, task_linear
+from wbm.kernels.wbc_dampers import damper_entry
+from wbm.kernels.wbc_dense import cholesky_solve, task_hessian, task_linear
 
 wp.set_module_options({"enable_backward": False})
 

@@ -15,7 +15,6 @@ class TeacherConfig:
         supports: kinds of scene that it learns on.
         split: objects that it learns on.
         eval_split: objects of the periodic evaluation.
-        seed: seeds the network, exploration and every episode.
         num_envs: environments in parallel.
         iterations: PPO iterations at most.
         eval_every: iterations between deterministic evaluations.
@@ -31,7 +30,6 @@ class TeacherConfig:
     supports: tuple[str, ...] = ("table", "bin")
     split: str = "train"
     eval_split: str = "val"
-    seed: int = 0
     num_envs: int = 128
     iterations: int = 400
     eval_every: int = 20

@@ -142,7 +142,7 @@ class _Run:
         self.optimizer.step()
         with torch.no_grad():
             decay = min(cfg.ema, (1 + self.step) / (10 + self.step))  # follows closely at first
-            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1.0 - decay)
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1.0 - decay)  # pyright: ignore[reportPrivateImportUsage]
         self.step += 1
         return figures
 

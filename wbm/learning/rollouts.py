@@ -76,13 +76,26 @@ class RolloutWorld:
         self.bank = self.assets.scenes.select(self.env.binding.scenes)
         self.teacher = RoutedTeacher(suite, self.env)
         self.perception = Perception(
-            load_robot(), self.assets.objects, self.bank, job.sensors, PolicySchema(), job.rollouts.num_envs, seed, job.device
+            load_robot(),
+            self.assets.objects,
+            self.bank,
+            job.sensors,
+            PolicySchema(),
+            job.rollouts.num_envs,
+            seed,
+            job.device,
         )
         self.schema = self.perception.schema
         self.noise = injected_noise(job.rollouts.noise, seed)
         texts = torch.as_tensor(self.assets.texts.embedding[self.bank.text[:, 0]], dtype=torch.float32)
         self.runner = EpisodeRunner(
-            self.env, self.schema, self.bank.kind, self.bank.object[:, 0], self.perception, texts.to(job.device), self.noise
+            self.env,
+            self.schema,
+            self.bank.kind,
+            self.bank.object[:, 0],
+            self.perception,
+            texts.to(job.device),
+            self.noise,
         )
 
     def level(self, episode: int) -> float:
@@ -113,9 +126,7 @@ def collect_shard(world: RolloutWorld, shard: int) -> ShardReport:
     cfg = world.job.rollouts
     writer = EpisodeWriter(world.job.folder, world.schema, shard)
     clean: dict[str, list[int]] = {kind: [0, 0] for kind in KINDS}
-    recorder = Recorder(
-        writer, world.describe, lambda r: r.success or cfg.keep == "all", world.env.period
-    )
+    recorder = Recorder(writer, world.describe, lambda r: r.success or cfg.keep == "all", world.env.period)
 
     def on_end(env: int, record: Record) -> None:
         if not record.near and world.level(record.episode) == 0.0:

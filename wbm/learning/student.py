@@ -1,5 +1,8 @@
 """The student: one transformer over tokens of an observation, for all 32 joints (paper, section D)."""
 
+# torch types registered buffers as Tensor | Module.
+# pyright: reportCallIssue=false
+
 from __future__ import annotations
 
 import json

@@ -18,6 +18,7 @@ from wbm.envs import rewards
 from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.outcome import REASONS, RUNNING
 from wbm.learning.config import PpoConfig, TeacherConfig
+from wbm.learning.curve import save_curve
 from wbm.learning.teacher_checkpoint import load_checkpoint, save_checkpoint
 from wbm.learning.teacher_evaluation import evaluate_teacher
 from wbm.learning.teacher_policy import TeacherSpec, load_teacher, save_teacher
@@ -51,6 +52,8 @@ def train_teacher(
     cfg: TeacherConfig,
     ppo: PpoConfig,
     directory: Path,
+    scratch: Path,
+    seed: int = 0,
     report: Callable[[Progress], None] | None = None,
 ) -> dict[str, float]:
     """Train to the last iteration, a plateau or the target, and keep the best policy under `directory`.
@@ -61,7 +64,9 @@ def train_teacher(
     Args:
         env: training environments.
         eval_env: environments of the periodic deterministic evaluation.
-        directory: receives `policy.safetensors`, `policy.json`, `curve.npz`, `checkpoint.pt` and TensorBoard's `events`.
+        directory: receives `policy.safetensors`, `policy.json`, `curve.json`, `curve.png` and TensorBoard's `logs`.
+        scratch: holds the checkpoint and the newest policy.
+        seed: of network and exploration; the environments have their own.
         report: called after each iteration.
 
     Returns:
@@ -72,15 +77,16 @@ def train_teacher(
     """
     from torch.utils.tensorboard import SummaryWriter
 
-    directory.mkdir(parents=True, exist_ok=True)
-    torch.manual_seed(cfg.seed)
-    obs = env.reset()
+    for folder in (directory, scratch):
+        folder.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(seed)
+    env.reset()
     alg = make_ppo(env, ppo)
     spec = teacher_spec(env, cfg, ppo)
     curve: dict[str, list[float]] = {}
-    start, best, stale = load_checkpoint(directory / "checkpoint.pt", alg, env, curve)
+    start, best, stale = load_checkpoint(scratch / "checkpoint.pt", alg, env, curve)
     obs = env.obs
-    writer = SummaryWriter(str(directory / "events"), purge_step=start)
+    writer = SummaryWriter(str(directory / "logs"), purge_step=start)
     began = time.monotonic()
     evaluation = curve["evaluation"][-1] if curve.get("evaluation") else float("nan")
 
@@ -93,7 +99,7 @@ def train_teacher(
             for _ in range(ppo.steps):
                 action = alg.act(_observation(obs))
                 obs, reward, done, info = env.step(action)
-                _watch(env, iteration, directory, reward=reward, obs=obs)
+                _watch(env, iteration, scratch, reward=reward, obs=obs)
                 alg.process_env_step(_observation(obs), reward, done, {"time_outs": info["time_outs"]})
                 rewards_sum += reward.mean().item()
                 terms += info["terms"].mean(0).cpu()
@@ -102,7 +108,7 @@ def train_teacher(
 
         # Learn
         losses = alg.update()
-        _watch(env, iteration, directory, weights=torch.cat([p.flatten() for p in alg.actor.parameters()]))
+        _watch(env, iteration, scratch, weights=torch.cat([p.flatten() for p in alg.actor.parameters()]))
 
         # Log
         finished = float(outcomes[RUNNING + 1 :].sum())
@@ -113,13 +119,13 @@ def train_teacher(
         row |= {f"term/{name}": float(value) / ppo.steps for name, value in zip(rewards.TERMS, terms, strict=True)}
         row |= {f"outcome/{name}": float(k) for name, k in zip(REASONS[1:], outcomes[1:], strict=True)}
         row |= {f"loss/{name}": value for name, value in losses.items()}
-        row |= {"lr": alg.learning_rate, "std": float(alg.actor.output_std.mean())}
+        row |= {"lr": alg.learning_rate, "std": float(alg.actor.output_std.detach().mean())}
 
         # Evaluate, keep the best
         last = iteration + 1 == cfg.iterations
         if (iteration + 1) % cfg.eval_every == 0 or last:
-            save_teacher(directory / "latest", spec, alg.actor.state_dict())
-            result = evaluate_teacher(eval_env, load_teacher(directory / "latest", env.device), cfg.eval_episodes)
+            save_teacher(scratch / "latest", spec, alg.actor.state_dict())
+            result = evaluate_teacher(eval_env, load_teacher(scratch / "latest", env.device), cfg.eval_episodes)
             evaluation = result["success"]
             row |= {f"eval/{name}": value for name, value in result.items()}
             stale = 0 if evaluation > best else stale + 1
@@ -134,7 +140,7 @@ def train_teacher(
             values.extend([float("nan")] * (iteration + 1 - len(values)))
 
         if (iteration + 1) % cfg.checkpoint_every == 0 or last:
-            save_checkpoint(directory / "checkpoint.pt", alg, env, curve, iteration + 1, best, stale)
+            save_checkpoint(scratch / "checkpoint.pt", alg, env, curve, iteration + 1, best, stale)
         if report is not None:
             done_now, elapsed = iteration + 1 - start, time.monotonic() - began
             pace = done_now * ppo.steps * env.num_envs / max(elapsed, 1e-9)
@@ -145,7 +151,7 @@ def train_teacher(
 
     writer.close()
     trained = len(curve["reward"])
-    np.savez(directory / "curve.npz", **{name.replace("/", "."): np.array(v, np.float32) for name, v in curve.items()})
+    save_curve(directory, curve, ppo.steps * env.num_envs, cfg.name)
     return {
         "success": best,
         "iterations": float(trained),

@@ -1,4 +1,4 @@
-"""Checkpoints of a teacher's training: networks, optimiser, random states and environments, so that resuming is exact."""
+"""Checkpoints of a training: networks, optimiser, random state and environments, so that resuming is exact."""
 
 from __future__ import annotations
 

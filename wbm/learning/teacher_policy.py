@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -51,7 +52,7 @@ class TeacherPolicy(nn.Module):
         self.spec = spec
         widths = (len(spec.obs_labels), *spec.hidden)
         layers: list[nn.Module] = []
-        for before, after in zip(widths, widths[1:], strict=False):
+        for before, after in pairwise(widths):
             layers += [nn.Linear(before, after), _ACTIVATIONS[spec.activation]()]
         self.mlp = nn.Sequential(*layers, nn.Linear(widths[-1], len(spec.action_labels)))
 

@@ -4,6 +4,9 @@ All inputs are the fields of the policy schema in SI units; normalisation happen
 the weights. An invalid point never reaches a pooled value: clouds may be empty.
 """
 
+# torch types registered buffers as Tensor | Module.
+# pyright: reportOperatorIssue=false
+
 from __future__ import annotations
 
 import torch

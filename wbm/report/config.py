@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 SPLITS = ("train", "test", "all")
 
@@ -16,10 +16,9 @@ class EvaluationConfig:
         seed: seed of the protocol.
         split: objects to grasp: `train`, `test` or `all`.
         num_envs: environments that run side by side.
-        max_time_s: an episode that has not succeeded by then fails with `timeout`, s.
-        lift_height_m: height above the start that counts as lifted, m.
-        hold_time_s: how long the object must stay lifted, s.
-        distractors: distractor objects in each scene, at most.
+        start: `whole_body`, or `local` at the pre-grasp (what a teacher was trained on).
+        condition: what a student is given of its target: `both`, the `mask` alone or the `text` alone.
+        workers: processes; does not change the result.
         videos: episodes to film, as many successes as failures where there are both.
         video_width, video_height: size of a film, pixels (even).
         video_fps: frames a second of the film.
@@ -32,10 +31,9 @@ class EvaluationConfig:
     seed: int = 1
     split: str = "test"
     num_envs: int = 32
-    max_time_s: float = 16.0
-    lift_height_m: float = 0.10
-    hold_time_s: float = 1.0
-    distractors: int = 2
+    start: str = "whole_body"
+    condition: str = "both"
+    workers: int = field(default=2, metadata={"key": False})
     videos: int = 8
     video_width: int = 480
     video_height: int = 360
@@ -47,10 +45,13 @@ class EvaluationConfig:
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
             raise ValueError(f"evaluation.split is {self.split!r}, must be one of {', '.join(SPLITS)}")
-        for name in ("episodes", "num_envs", "max_time_s", "lift_height_m", "hold_time_s", "video_fps"):
+        for name, allowed in (("start", ("whole_body", "local")), ("condition", ("both", "mask", "text"))):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"evaluation.{name} is {getattr(self, name)!r}, must be one of {', '.join(allowed)}")
+        for name in ("episodes", "num_envs", "workers", "video_fps"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"evaluation.{name} is {getattr(self, name)}, must be positive")
-        for name in ("distractors", "videos", "filmstrips", "record_episodes", "embed_mb"):
+        for name in ("videos", "filmstrips", "record_episodes", "embed_mb"):
             if getattr(self, name) < 0:
                 raise ValueError(f"evaluation.{name} is {getattr(self, name)}, must not be negative")
         for name in ("video_width", "video_height"):

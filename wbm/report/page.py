@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from collections.abc import Sequence
@@ -29,10 +30,10 @@ def write_page(
 
     Args:
         path: the HTML file.
-        result: the keys of `stats.summarise`, and optionally `records` (one dictionary an episode, see `summarise`; with `seed`,
-            `instruction`, `video`: path or None, `filmstrip`: list of `phase`, `outer`, `camera` (paths), `time_s`), `curves`
-            (name -> {arm -> {`steps`, `values`}}), `figure4` (list of `name`, `note`, `arms` as `plots.figure4` takes them), `notes`
-            (sentences), `config` and `provenance` (JSON-ready).
+        result: the keys of `stats.summarise`, and optionally `records` (one dictionary an episode, see `summarise`;
+            with `seed`, `instruction`, `video`: path or None, `filmstrip`: list of `phase`, `outer`, `camera` (paths),
+            `time_s`), `curves` (name -> {arm -> {`steps`, `values`}}), `figure4` (list of `name`, `note`, `arms` as
+            `plots.figure4` takes them), `notes` (sentences), `config` and `provenance` (JSON-ready).
         base: folder that paths in `result` are relative to; the page's folder by default.
         title: heading.
         embed_mb: largest total size of embedded videos, MB; failures of different reasons and successes come first.
@@ -172,7 +173,7 @@ def _verdict(name: str, arms: Sequence[dict[str, Any]]) -> list[str]:
     ranked = sorted(arms, key=lambda a: -a["success_rate"])
     order = ", ".join(f"{a['label'].lower()} {percent(a['success_rate'])}" for a in ranked)
     expected = [a["key"] for a in ranked] == list(PAPER_SUCCESS)
-    apart = not any(overlap(a["success_ci95"], b["success_ci95"]) for a, b in zip(ranked, ranked[1:], strict=False))
+    apart = not any(overlap(a["success_ci95"], b["success_ci95"]) for a, b in itertools.pairwise(ranked))
     lead = f"{name}: {order}." if name else f"{order.capitalize()}."
     if expected and apart:
         return [f"{lead} The order is the paper's and the intervals are apart."]

@@ -24,7 +24,7 @@ ARM_COLOURS = {"full": "#2a7de1", "no_active_vision": "#e08a1e", "joint_space": 
 SERIES_COLOURS = ("#2a7de1", "#e08a1e", "#2f9e77", "#c4497c", "#7d6bd6", "#8a8f98")
 FAILURE_COLOUR = "#c4497c"
 
-_STYLE = {
+_STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "wbm",
     "font.family": "sans-serif",
@@ -175,7 +175,7 @@ def figure4(arms: Sequence[dict[str, Any]], title: str = "") -> Figure:
 
 
 def figure4_panels(arms: Sequence[dict[str, Any]]) -> tuple[Figure | None, Figure]:
-    """The two panels of `figure4` as figures of their own, for pages that stack them; the first is None without curves."""
+    """The two panels of `figure4`, for pages that stack them; the first is None without curves."""
     with matplotlib.rc_context(_STYLE):
         left = None
         if curves := _arm_curves(arms):

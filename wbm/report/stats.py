@@ -55,12 +55,12 @@ def summarise(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Numbers of an evaluation, JSON-ready.
 
     Args:
-        records: one dictionary an episode: `success`, `reason` (empty on success), `object`, `scene`; optional `collision`,
-            `wrong_object` (bool), `target_visible` (share of steps), `time_to_grasp_s` (None unless successful).
+        records: one dictionary an episode: `success`, `reason` (empty on success), `object`, `scene`; optional
+            `collision`, `wrong_object` (bool), `target_visible` (share of steps), `time_to_grasp_s` (None on failure).
 
     Returns:
-        `episodes`, `success_rate`, `success_ci95`, `collision_rate`, `wrong_object_rate`, `target_visible`, `time_to_grasp_s`,
-        `failures` (by reason, most frequent first), `by_object`, `by_scene`.
+        `episodes`, `success_rate`, `success_ci95`, `collision_rate`, `wrong_object_rate`, `target_visible`,
+        `time_to_grasp_s`, `failures` (by reason, most frequent first), `by_object`, `by_scene`.
     """
     overall = rate(r["success"] for r in records)
     times = [r["time_to_grasp_s"] for r in records if r["success"] and r.get("time_to_grasp_s") is not None]

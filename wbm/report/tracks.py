@@ -60,11 +60,13 @@ def mats_to_quats(rot: np.ndarray) -> np.ndarray:
     return quat if quat[0, 0] >= 0 else -quat
 
 
-def episode_tracks(episode: dict[str, Any], solids: tuple[Solid, ...] = (), robot: RobotModel | None = None) -> EpisodeTracks:
+def episode_tracks(
+    episode: dict[str, Any], solids: tuple[Solid, ...] = (), robot: RobotModel | None = None
+) -> EpisodeTracks:
     """Tracks of a stored episode.
 
     Args:
-        episode: step fields [T, ...] of the dataset and the facts of the episode (`instructions`, `object`, `scene`, `success`).
+        episode: step fields [T, ...] of the dataset and the facts of the episode (`instructions`, `success`).
         solids: supports and objects, from `scene_solids`.
         robot: the robot; the standard one by default.
     """
@@ -100,7 +102,14 @@ def scene_solids(assets: Any, scene: int, target_pos: np.ndarray | None = None) 
     bank, objects = assets.scenes, assets.objects
     rgb = (*np.asarray(bank.support_rgb[scene], dtype=float), 1.0)
     solids = [
-        Solid(f"support {i}", BOX, bank.support_size[scene, i], rgb, bank.support_pos[scene, i], bank.support_quat[scene, i])
+        Solid(
+            f"support {i}",
+            BOX,
+            bank.support_size[scene, i],
+            rgb,
+            bank.support_pos[scene, i],
+            bank.support_quat[scene, i],
+        )
         for i in range(int(bank.support_count[scene]))
     ]
     for column, index in enumerate(bank.object[scene]):
@@ -141,11 +150,13 @@ def scene_tracks(assets: Any, scene: int) -> EpisodeTracks:
     return EpisodeTracks(**{**tracks.__dict__, "solids": scene_solids(assets, scene)})
 
 
-def write_episode_mcap(path: str | Path, episode: dict[str, Any], schema: PolicySchema, solids: tuple[Solid, ...] = ()) -> int:
+def write_episode_mcap(
+    path: str | Path, episode: dict[str, Any], schema: PolicySchema, solids: tuple[Solid, ...] = ()
+) -> int:
     """A stored episode as MCAP: Foxglove topics and every numeric array; returns the number of messages."""
     names = [f.name for f in schema.observation if f.name != "text"]
     arrays = {n: np.asarray(episode[n]) for n in (*names, *_STEP_FIELDS) if n in episode}
     solids = solids or (target_marker(np.asarray(episode["p_obj_w"], dtype=np.float64)),)
-    facts = {k: v for k, v in episode.items() if isinstance(v, (str, bool, int, float)) or k == "instructions"}
-    facts["instructions"] = [str(s) for s in facts.get("instructions", [])]
+    facts: dict[str, Any] = {k: v for k, v in episode.items() if isinstance(v, (str, bool, int, float))}
+    facts["instructions"] = [str(s) for s in episode.get("instructions", [])]
     return write_mcap(path, episode_tracks(episode, solids), arrays, facts)

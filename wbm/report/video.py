@@ -17,6 +17,12 @@ RenderRgb = Callable[..., np.ndarray]
 """`render_rgb(scene, env, pos, quat, width, height, fov_deg)`: uint8 [height, width, 3] from a camera at `pos` (W, m)
 with optical orientation `quat` (w x y z; x right, y down, z forward)."""
 
+_H264 = [
+    "-crf", "26", "-preset", "veryfast", "-movflags", "+faststart",
+    # one thread and no names of programs: same frames, same bytes
+    "-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",
+]  # fmt: skip
+
 KEY_PHASES = ("approach", "tracking", "preshape", "contact", "lift")
 
 
@@ -35,10 +41,11 @@ def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> int
                 shape = frame.shape
                 if shape[0] % 2 or shape[1] % 2:
                     raise ValueError(f"video {path}: frames are {shape[1]} x {shape[0]}, H.264 needs even sizes")
-                writer = imageio_ffmpeg.write_frames(
-                    str(path), (shape[1], shape[0]), fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2,
-                    ffmpeg_log_level="error", quality=None, ffmpeg_timeout=60,
-                    output_params=["-crf", "26", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1"],
+                # its annotations are narrower than what it takes
+                writer = imageio_ffmpeg.write_frames(  # pyright: ignore
+                    str(path), (shape[1], shape[0]), fps=fps, codec="libx264", pix_fmt_out="yuv420p",  # pyright: ignore[reportArgumentType]
+                    macro_block_size=2, ffmpeg_log_level="error", quality=None, ffmpeg_timeout=60,  # pyright: ignore[reportArgumentType]
+                    output_params=_H264,
                 )  # fmt: skip
                 writer.send(None)
             if frame.shape != shape:

@@ -17,7 +17,7 @@ from wbm.robot.model import RobotModel, load_robot
 from wbm.robot.spheres import batched_kinematics, robot_spheres
 
 _TARGET_RGB = np.array([255, 70, 20], dtype=np.uint8)
-_LIDAR_RGB = (60, 130, 220)
+_LIDAR_RGB = np.array([60, 130, 220], dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,9 @@ class Viewer:
             self._show_clouds(k)
             if (item := self._item).ee_target is not None:
                 self._parts["ee_target"].position = item.ee_target[k]
-            self._clock.content = f"**{self.tracks.times[k]:.2f} s**, step {k} of {len(self.tracks.times) - 1}\n\n{self._remark(k)}"
+            self._clock.content = (
+                f"**{self.tracks.times[k]:.2f} s**, step {k} of {len(self.tracks.times) - 1}\n\n{self._remark(k)}"
+            )
             if self._scrub.value != k:
                 self._scrub.value = k
         self._follow()
@@ -168,14 +170,23 @@ class Viewer:
             for i, solid in enumerate(tracks.solids):
                 first = (solid.pos[0], solid.quat[0]) if np.ndim(solid.pos) == 2 else (solid.pos, solid.quat)
                 handle = _add_solid(
-                    self.server.scene, f"/scene/{i}", solid.type, solid.size, solid.rgba[:3], *first, solid.vertices, solid.faces
+                    self.server.scene,
+                    f"/scene/{i}",
+                    solid.type,
+                    solid.size,
+                    solid.rgba[:3],
+                    *first,
+                    solid.vertices,
+                    solid.faces,
                 )
                 self._parts[f"solid {i}"] = handle
                 self._groups["solids"].append(handle)
                 if np.ndim(solid.pos) == 2:
                     self._moving.append((handle, solid))
             if self._item.ee_target is not None:
-                self._parts["ee_target"] = self.server.scene.add_frame("/target/ee", axes_length=0.08, axes_radius=0.004)
+                self._parts["ee_target"] = self.server.scene.add_frame(
+                    "/target/ee", axes_length=0.08, axes_radius=0.004
+                )
             self._scrub.max = max(1, len(tracks.times) - 1)
         self.show(0)
 
@@ -192,13 +203,19 @@ class Viewer:
         if self.tracks.lidar is not None:
             xyz, valid = (a[k] for a in self.tracks.lidar)
             points = xyz[valid != 0]
-            self._put_cloud("lidar", f"/robot/{base}/lidar_points", points, np.tile(np.uint8(_LIDAR_RGB), (len(points), 1)), 0.02)
+            self._put_cloud("lidar", f"/robot/{base}/lidar_points", points, np.tile(_LIDAR_RGB, (len(points), 1)), 0.02)
 
     def _put_cloud(self, key: str, path: str, points: np.ndarray, colours: np.ndarray, size: float) -> None:
         layer = {"camera": "Camera points", "lidar": "LiDAR points"}[key]
         if key not in self._parts:
             self._parts[key] = self.server.scene.add_point_cloud(
-                path, points, colours, point_size=size, point_shape="circle", precision="float32", visible=self._layers[layer].value
+                path,
+                points,
+                colours,
+                point_size=size,
+                point_shape="circle",
+                precision="float32",
+                visible=self._layers[layer].value,
             )
             self._groups[key] = [self._parts[key]]
         else:
@@ -250,7 +267,7 @@ def _add_solid(
     faces: np.ndarray | None = None,
 ) -> Any:
     """Draw a primitive (MuJoCo's numbers and half sizes) or a mesh; returns the handle that carries its pose."""
-    colour = tuple(int(round(255 * float(c))) for c in rgb[:3])
+    colour = tuple(round(255 * float(c)) for c in rgb[:3])
     pose = {"position": tuple(float(v) for v in pos), "wxyz": tuple(float(v) for v in quat)}
     if kind == BOX:
         return scene.add_box(path, color=colour, dimensions=tuple(2 * float(s) for s in size), **pose)
@@ -266,5 +283,7 @@ def _add_solid(
             scene.add_icosphere(f"{path}/{name}", radius=radius, color=colour, position=(0.0, 0.0, z))
         return root
     if kind == MESH and vertices is not None and faces is not None:
-        return scene.add_mesh_simple(path, np.float32(vertices), np.uint32(faces), color=colour, flat_shading=True, **pose)
+        return scene.add_mesh_simple(
+            path, np.float32(vertices), np.uint32(faces), color=colour, flat_shading=True, **pose
+        )
     raise ValueError(f"geometry type {kind} of {path} cannot be drawn")

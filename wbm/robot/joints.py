@@ -22,18 +22,16 @@ WBC = np.r_[0:10, 26:32]  # the joints that the whole-body controller moves
 FINGERS: tuple[str, ...] = ("index", "middle", "ring", "thumb")
 FINGER_PREFIX = {"index": "if", "middle": "mf", "ring": "rf", "thumb": "th"}
 
-HAND_JOINTS: tuple[str, ...] = tuple(f"{p}_{j}" for p in ("if", "mf", "rf") for j in ("mcp", "rot", "pip", "dip")) + (
-    "th_cmc",
-    "th_axl",
-    "th_mcp",
-    "th_ipl",
+HAND_JOINTS: tuple[str, ...] = (
+    *(f"{p}_{j}" for p in ("if", "mf", "rf") for j in ("mcp", "rot", "pip", "dip")),
+    *("th_cmc", "th_axl", "th_mcp", "th_ipl"),
 )
 
 JOINT_NAMES: tuple[str, ...] = (
-    ("base_x", "base_y", "base_yaw")
-    + tuple(f"arm_joint{i}" for i in range(1, 8))
-    + tuple(f"hand_{j}" for j in HAND_JOINTS)
-    + tuple(f"neck_joint{i}" for i in range(1, 7))
+    *("base_x", "base_y", "base_yaw"),
+    *(f"arm_joint{i}" for i in range(1, 8)),
+    *(f"hand_{j}" for j in HAND_JOINTS),
+    *(f"neck_joint{i}" for i in range(1, 7)),
 )
 
 QD_MAX = np.concatenate(

@@ -284,7 +284,7 @@ def forward_kinematics(robot: RobotModel, q: np.ndarray) -> tuple[np.ndarray, np
         if robot.joint_type[i] == SLIDE:
             pos[i] = pos[i] + rot[i] @ (robot.joint_axis[i] * q[robot.joint_index[i]])
         elif robot.joint_type[i] == HINGE:
-            rot[i] = rot[i] @ axis_angle_to_mat(robot.joint_axis[i], q[robot.joint_index[i]])
+            rot[i] = rot[i] @ axis_angle_to_mat(robot.joint_axis[i], q[robot.joint_index[i]])  # pyright: ignore[reportArgumentType]
     return rot, pos
 
 

@@ -109,7 +109,7 @@ def _cover_box(half: np.ndarray, allowance: tuple[float, float, float]) -> tuple
         radius = float(np.linalg.norm(cell)) - COVER_SLACK
         excess = float(np.max(radius - cell - allowance))
         key = (int(np.prod(grid)) if excess <= 0 else 10_000, excess, grid)
-        best = key if best is None else min(best, key)
+        best = key if best is None else min(best, key)  # pyright: ignore[reportAssignmentType]
     assert best is not None
     grid = np.array(best[2])
     cell = half / grid
@@ -195,7 +195,7 @@ def self_pairs(robot: RobotModel, spheres: SphereSet) -> np.ndarray:
         nearest = np.minimum.reduceat(gap, starts, axis=1)[:, key]
         needed |= ((gap < PAIR_REACH) & (gap <= nearest + NEAREST_SLACK)).any(axis=0)
         overlaps += (gap < 0).sum(axis=0)
-    keep = needed & (overlaps < ALWAYS_NEAR * PAIR_SAMPLES) & (home_gap > 0)
+    keep = needed & (overlaps < ALWAYS_NEAR * PAIR_SAMPLES) & (home_gap > 0)  # pyright: ignore[reportOptionalOperand]
     chosen = pairs[keep]
     return chosen[np.lexsort((chosen[:, 1], chosen[:, 0]))].astype(np.int32)
 

@@ -44,7 +44,7 @@ def store_arrays(section: str, key: str, **arrays: np.ndarray) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=folder, suffix=".tmp", delete=False) as stream:
             temporary = stream.name
-            np.savez_compressed(stream, **arrays)
+            np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
         os.replace(temporary, folder / f"{key}.npz")
     except OSError:
         if temporary and os.path.exists(temporary):

@@ -110,7 +110,7 @@ def jar(rng: np.random.Generator) -> Draft:
 def mug(rng: np.random.Generator) -> Draft:
     radius, height = rng.uniform(0.034, 0.042), rng.uniform(0.07, 0.10)
     wall, floor = 0.005, 0.006
-    parts = _wall((radius - wall,) * 2, (radius,) * 2, (floor, height), 5)
+    parts = _wall((radius - wall,) * 2, (radius,) * 2, (floor, height), 5)  # pyright: ignore[reportArgumentType]
     parts.append(_cylinder(radius, 0, floor))
     reach, grip = rng.uniform(0.022, 0.03), rng.uniform(0.4, 0.55) * height
     top = 0.5 * (height + grip)

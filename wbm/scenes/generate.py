@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
 
 import mjbatch
@@ -12,10 +13,11 @@ from wbm.robot.model import load_robot
 from wbm.scenes.bank import SceneBank, stack_scenes
 from wbm.scenes.cache import array_digest, code_digest, load_arrays, store_arrays
 from wbm.scenes.config import ScenesConfig
-from wbm.scenes.model import SceneModel, SceneModelConfig
+from wbm.scenes.model import SceneModel
 from wbm.scenes.objects import SPLITS, ObjectSet
 from wbm.scenes.placement import draw_scene, fits
 
+Track = Callable[[Iterable], Iterable]
 STEP = 0.004
 MAX_ROUNDS = 8
 MAX_TILT = 0.15  # rad that settling may turn an object
@@ -23,29 +25,32 @@ MAX_SHIFT = 0.015  # m that settling may move it
 
 
 def wanted(cfg: ScenesConfig, objects: ObjectSet) -> dict[str, int]:
-    """Scenes of every kind by split; splits without objects get none."""
+    """Scenes of every kind by split; val and test get none where they have no objects.
+
+    Raises:
+        ValueError: there are no objects for training.
+    """
+    if not (objects.split == "train").any():
+        raise ValueError(f"scenes: none of the {len(objects)} objects is for training; add objects or change the seed")
     count = {"train": cfg.count, "val": max(1, cfg.count // 10), "test": cfg.test_count}
     return {s: count[s] for s in SPLITS if count[s] > 0 and (objects.split == s).any()}
 
 
-def generate_scenes(
-    objects: ObjectSet, cfg: ScenesConfig, seed: int, model: SceneModel | None = None, progress=None
-) -> SceneBank:
-    """A bank with the wanted number of settled scenes of every kind and split.
+def generate_scenes(model: SceneModel, cfg: ScenesConfig, seed: int, track: Track = iter) -> SceneBank:
+    """A bank with the wanted number of settled scenes of every kind and split, of the model's objects.
 
     Args:
-        model: a scene model to settle in; built when missing.
-        progress: wraps the list of (split, kind, count) with a progress bar.
+        track: wraps the list of (split, kind, count) with a progress bar.
 
     Raises:
         ValueError: a kind and split could not be filled, named with the counts.
     """
-    model = model or SceneModel(objects, SceneModelConfig(num_distractors=cfg.num_distractors))
+    objects = model.objects
     jobs = [(split, kind, n) for split, n in wanted(cfg, objects).items() for kind in cfg.kinds]
     jobs = [job for job in jobs if job[0] != "val" or (fits(job[1], objects) & (objects.split == "val")).any()]
     content = array_digest(code_digest(), mujoco.__version__, *(getattr(objects, f.name) for f in fields(ObjectSet)))
     banks = []
-    for split, kind, count in progress(jobs) if progress else jobs:
+    for split, kind, count in track(jobs):
         key = array_digest(content, replace(cfg, count=1, test_count=0, encoder=""), seed, split, kind, count)
         kept = load_arrays("scenes", key)
         if kept is None:

@@ -18,6 +18,7 @@ from wbm.robot.facts import quat_to_mat
 from wbm.robot.mjcf import OBJECT_BIT, ROBOT_BIT, STATIC_BIT, MjcfOptions, add_contact_sensors, build_robot
 from wbm.robot.model import load_robot
 from wbm.scenes.bank import NUM_SUPPORTS, SceneBank
+from wbm.scenes.fields import body_tables, columns, write
 from wbm.scenes.objects import ObjectSet
 from wbm.scenes.parts import BOX, MAX_PARTS, MESH, Part, part_mesh
 
@@ -84,7 +85,7 @@ class SceneModel:
         self.sensors = tuple(model.sensor(i).name for i in range(model.nsensor))
         self.robot_nq = len(self.robot.joint_names)
         self._robot_mass = float(model.body_subtreemass[0] - model.body_mass[self.body_ids].sum())
-        self._tables = self._geom_tables() | _body_tables(objects)
+        self._tables = self._geom_tables() | body_tables(objects)
         native = self.cfg.slots == "native"
         self.geom_fields = tuple(f for f in _GEOM_FIELDS if native or f != "geom_type") + (
             _BIT_FIELDS if native else ()
@@ -131,15 +132,15 @@ class SceneModel:
         tables = self._tables
         for name in self.geom_fields:
             values = tables[name][chosen]
-            _write(field(name), ids, self._slots, values.reshape(count, width * MAX_PARTS, *values.shape[3:]))
+            write(field(name), ids, self._slots, values.reshape(count, width * MAX_PARTS, *values.shape[3:]))
         self._load_supports(field, ids, bank, scenes)
         if friction is not None:
-            per_slot = np.repeat(np.broadcast_to(_columns(friction), (count, width)), MAX_PARTS, axis=1)
-            _write(field("geom_friction"), ids, self._slots, per_slot, component=0)
-        scale = np.ones((count, width)) if mass_scale is None else np.broadcast_to(_columns(mass_scale), (count, width))
+            per_slot = np.repeat(np.broadcast_to(columns(friction), (count, width)), MAX_PARTS, axis=1)
+            write(field("geom_friction"), ids, self._slots, per_slot, component=0)
+        scale = np.ones((count, width)) if mass_scale is None else np.broadcast_to(columns(mass_scale), (count, width))
         self._load_masses(field, ids, chosen, scale)
         poses = np.concatenate([bank.object_pos[scenes], bank.object_quat[scenes]], axis=2).reshape(count, -1)
-        _write(qpos, ids, slice(0, self.object_qpos.stop), np.concatenate([bank.q_start[scenes], poses], axis=1))
+        write(qpos, ids, slice(0, self.object_qpos.stop), np.concatenate([bank.q_start[scenes], poses], axis=1))
 
     def _load_supports(self, field: Field, ids: np.ndarray, bank: SceneBank, scenes: np.ndarray) -> None:
         size = bank.support_size[scenes]
@@ -151,10 +152,10 @@ class SceneModel:
             "geom_aabb": np.concatenate([np.zeros_like(size), size], axis=2),
         }
         for name, value in values.items():
-            _write(field(name), ids, self._supports, value)
+            write(field(name), ids, self._supports, value)
         if "geom_contype" in self.geom_fields:
             used = np.arange(NUM_SUPPORTS) < bank.support_count[scenes, None]
-            _write(field("geom_contype"), ids, self._supports, np.where(used, STATIC_BIT, 0))
+            write(field("geom_contype"), ids, self._supports, np.where(used, STATIC_BIT, 0))
 
     def _load_masses(self, field: Field, ids: np.ndarray, chosen: np.ndarray, scale: np.ndarray) -> None:
         tables = self._tables
@@ -169,12 +170,12 @@ class SceneModel:
             "body_subtreemass": mass,
         }
         for name, value in values.items():
-            _write(field(name), ids, self._bodies, value)
-        _write(field("body_subtreemass"), ids, slice(0, 1), self._robot_mass + mass.sum(axis=1, keepdims=True))
+            write(field(name), ids, self._bodies, value)
+        write(field("body_subtreemass"), ids, slice(0, 1), self._robot_mass + mass.sum(axis=1, keepdims=True))
         count = len(ids)
-        _write(field("dof_M0"), ids, self._dofs, (tables["dof_M0"][chosen] * scale[..., None]).reshape(count, -1))
+        write(field("dof_M0"), ids, self._dofs, (tables["dof_M0"][chosen] * scale[..., None]).reshape(count, -1))
         inverse = tables["dof_invweight0"][chosen] / scale[..., None]
-        _write(field("dof_invweight0"), ids, self._dofs, inverse.reshape(count, -1))
+        write(field("dof_invweight0"), ids, self._dofs, inverse.reshape(count, -1))
 
     def _template(self) -> mujoco.MjSpec:
         spec = self._base_spec()
@@ -345,55 +346,3 @@ def _add_support(spec: mujoco.MjSpec, i: int, size: np.ndarray, pos: np.ndarray,
 def _add_slot(body: mujoco.MjsBody, **geom: Any) -> None:
     # Priority: the object's friction and contact parameters decide every contact it takes part in.
     body.add_geom(contype=OBJECT_BIT, conaffinity=EVERYTHING, priority=1, mass=0.0, **geom)
-
-
-def _body_tables(objects: ObjectSet) -> dict[str, np.ndarray]:
-    """Masses and what MuJoCo derives from them for a free body, [O+1,...]; the last row is an absent object.
-
-    With mass m, inertia I about the centre of mass at offset c, and C = [c]x, the free body's mass matrix at the
-    reference pose is [[m 1, -m C], [m C, I - m C C]]; its inverse has the blocks 1/m - C I^-1 C and I^-1.
-    """
-    mass = np.append(objects.mass, 0.1)
-    inertia = np.concatenate([objects.inertia, [[1e-4] * 3]])
-    com = np.concatenate([objects.com, np.zeros((1, 3))])
-    iquat = np.concatenate([objects.iquat, [[1.0, 0, 0, 0]]])
-    axes = quat_to_mat(iquat)
-    tensor = np.einsum("oij,oj,okj->oik", axes, inertia, axes)
-    inverse = np.einsum("oij,oj,okj->oik", axes, 1 / inertia, axes)
-    x, y, z = com.T
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    linear = 1 / mass[:, None] - np.einsum("oij,ojk,oki->oi", cross, inverse, cross)
-    rotor = tensor - mass[:, None, None] * cross @ cross
-    three = np.ones((1, 3))
-    diagonal = np.diagonal(inverse, axis1=1, axis2=2)
-    return {
-        "body_mass": mass,
-        "body_inertia": inertia,
-        "body_ipos": com,
-        "body_iquat": iquat,
-        "body_gravcomp": np.append(np.zeros(len(objects)), 1.0),
-        "body_invweight0": np.stack([1 / mass, diagonal.mean(axis=1)], axis=1),
-        "dof_M0": np.concatenate([mass[:, None] * three, np.diagonal(rotor, axis1=1, axis2=2)], axis=1),
-        "dof_invweight0": np.concatenate(
-            [linear.mean(axis=1)[:, None] * three, diagonal.mean(axis=1)[:, None] * three], axis=1
-        ),
-    }
-
-
-def _columns(values: np.ndarray) -> np.ndarray:
-    values = np.asarray(values, dtype=float)
-    return values[:, None] if values.ndim == 1 else values
-
-
-def _write(target: Any, ids: np.ndarray, columns: slice, values: np.ndarray, component: int | None = None) -> None:
-    """`target[ids, columns] = values` for a NumPy array or a torch tensor on any device."""
-    if not isinstance(target, np.ndarray):
-        import torch
-
-        values = torch.as_tensor(np.ascontiguousarray(values), dtype=target.dtype, device=target.device)
-        ids = torch.as_tensor(ids, device=target.device)
-    if component is None:
-        target[ids, columns] = values
-    else:
-        target[ids, columns, component] = values

@@ -167,7 +167,7 @@ def _row(entry: ObjectEntry, hulls: list[np.ndarray]) -> dict:
         slot_type[k], slot_size[k], slot_pos[k], slot_quat[k] = part.type, part.size, part.pos, part.quat
         if part.type == MESH:
             slot_hull[k] = len(hulls)
-            hulls.append(part.vertices)
+            hulls.append(part.vertices)  # pyright: ignore[reportArgumentType]
     volume, com, tensor = combined_moments(parts)
     moments, axes = np.linalg.eigh(tensor * entry.mass / volume)
     axes[:, 0] *= np.sign(np.linalg.det(axes))

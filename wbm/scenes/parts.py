@@ -128,7 +128,7 @@ def combined_moments(parts: list[Part]) -> tuple[float, np.ndarray, np.ndarray]:
     for v, c, i in moments:
         d = c - centre
         inertia += i + v * (d @ d * np.eye(3) - np.outer(d, d))
-    return volume, centre, inertia
+    return volume, centre, inertia  # pyright: ignore[reportReturnType]
 
 
 def bounds(parts: list[Part]) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from wbm.scenes.model import SceneModel, SceneModelConfig
 from wbm.scenes.objects import ObjectSet
 from wbm.scenes.parts import part_mesh
 
-MAX_OBJECTS, MAX_SCENES = 96, 18
+MAX_OBJECTS, MAX_SCENES = 96, 12
 _SKY = np.array([0.95, 0.96, 0.98])
 _LIGHT = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
 _SUPERSAMPLE = 2
@@ -78,7 +78,7 @@ def scene_sheet(objects: ObjectSet, bank: SceneBank, path: Path, size: tuple[int
         tiles.append(
             (image, f"{KINDS[bank.kind[k]]}: {objects.color[bank.object[k, 0]]} {objects.noun[bank.object[k, 0]]}")
         )
-    _write_sheet(tiles, 6, path)
+    _write_sheet(tiles, 4, path)
 
 
 def _alone(objects: ObjectSet, o: int) -> tuple[mujoco.MjModel, mujoco.MjData]:

@@ -40,7 +40,10 @@ def draw_scene(
     layout = draw_layout(kind, rng, cfg)
     targets = pool[fits(kind, objects)[pool]]
     if len(targets) == 0:
-        raise ValueError(f"scenes: none of the {len(pool)} {split} objects can be a target in a {kind} scene")
+        raise ValueError(
+            f"scenes: none of the {len(pool)} {split} objects can be a target in a {kind} scene; "
+            f"add objects, or leave {kind} out of scenes.kinds"
+        )
     placed = _place(layout, int(rng.choice(targets)), pool, objects, cfg, rng)
     if placed is None:
         return None

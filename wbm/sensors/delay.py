@@ -37,8 +37,8 @@ class FrameDelay:
         self._views = []
         for name, array in self._frame.items():
             width = array.strides[0] if n else 0
-            ring = wp.zeros((n, self._ring_size, width), dtype=wp.uint8, device=device)
-            self._views.append((_bytes(array, n, width), ring, _bytes(self.out[name], n, width)))
+            ring = wp.zeros((n, self._ring_size, width), dtype=wp.uint8, device=device)  # pyright: ignore[reportArgumentType]
+            self._views.append((_bytes(array, n, width), ring, _bytes(self.out[name], n, width)))  # pyright: ignore[reportArgumentType]
 
     def reset(self, env_ids: wp.array) -> None:
         """Start an episode in the given environments (device index array): frames from before it are forgotten."""

@@ -45,7 +45,7 @@ class RaySensor:
         turn: float = 0.0,
         exclude_body: int = -1,
         bundle: int = BUNDLE,
-        noise: RayNoise | None = None,
+        noise: RayNoise | None = None,  # pyright: ignore[reportGeneralTypeIssues]
         extrinsic: ExtrinsicNoise | None = None,
         seed: int = 0,
     ) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 INTEGRATORS = ("discrete", "implicitfast", "implicit", "euler")
 CONES = ("elliptic", "pyramidal")
@@ -73,3 +73,8 @@ EVALUATE = SimConfig(
     dt=0.004, decimation=10, integrator="implicitfast", condim=4, impratio=10.0, ls_iterations=50, tolerance=1e-6
 )
 """Fine physics in which success is reported and rollouts are recorded."""
+
+
+def evaluation_physics(cfg: SimConfig) -> SimConfig:
+    """`EVALUATE` on the engine and threads of `cfg`."""
+    return replace(EVALUATE, engine=cfg.engine, threads=cfg.threads)

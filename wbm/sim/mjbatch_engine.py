@@ -55,9 +55,10 @@ class MjBatchSimulation(Simulation):
 
     def load_state(self, state: dict[str, torch.Tensor]) -> None:
         rows = torch.from_numpy(self._batch.bind("state"))
+        # Writes that wait in the float32 tensors would land on top of the rows: a call takes them away first. A second
+        # call brings the tensors to the rows; it moves the solver's warm start, so the rows are written once more.
+        self._batch.forward()
         rows.copy_(state["state"])
-        # The float32 tensors follow the rows only through a call, and a stale one would be read as a write. The call
-        # moves the solver's warm start, so the rows are written once more.
         self._batch.forward()
         rows.copy_(state["state"])
         self.sensordata.copy_(state["sensordata"])

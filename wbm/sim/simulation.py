@@ -110,20 +110,16 @@ def make_simulation(model: mujoco.MjModel, num_envs: int, cfg: SimConfig, device
     """Build the engine that `cfg.engine` names; `model` is given `cfg`'s options first.
 
     Raises:
-        ValueError: the engine cannot run on `device`, or is not installed.
+        ValueError: the engine cannot run on `device`, or is not available.
     """
     apply_options(model, cfg)
     if cfg.engine == "mjbatch":
         from wbm.sim.mjbatch_engine import MjBatchSimulation
 
         if device != "cpu":
-            raise ValueError(f"sim.engine=mjbatch runs on the CPU, not on {device!r}; use sim.engine=mujoco_warp")
+            raise ValueError(f"sim.engine=mjbatch runs on the CPU, not on {device!r}")
         return MjBatchSimulation(model, num_envs, cfg.threads)
-    try:
-        from wbm.sim.warp_engine import MujocoWarpSimulation
-    except ImportError as error:
-        raise ValueError(f"sim.engine=mujoco_warp needs the package mujoco-warp: {error}") from error
-    return MujocoWarpSimulation(model, num_envs, device)
+    raise ValueError(f"sim.engine={cfg.engine} is not available in this version; use sim.engine=mjbatch")
 
 
 def env_ids(ids: torch.Tensor) -> np.ndarray:

@@ -1,0 +1,150 @@
+"""Stage evaluate: closed-loop success on held-out objects and scenes, with intervals, reasons, films and a page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+KIND = "evaluation"
+SECTIONS = ("seed", "robot", "sim", "wbc", "sensors", "env", "evaluation")
+INPUTS = ("assets", "policy:student")
+BLOCK = 32
+
+
+def name(cfg: Any) -> str:
+    """Named after where episodes start and what the policy is told of its target."""
+    e = cfg.evaluation
+    return "main" if (e.start, e.condition) == ("whole_body", "both") else f"{e.start}_{e.condition}"
+
+
+def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
+    """Play the episodes in blocks, then write numbers, films, recorded episodes and `report.html`.
+
+    Args:
+        cfg: reads the sections named in `SECTIONS`.
+        inputs: `assets` and `policy`: a student, a teacher or a bundle.
+        draft: the artifact being written.
+        progress: offers `task` and `track`.
+    """
+    from wbm.report.page import write_page
+    from wbm.report.stats import summarise
+
+    records = _play(cfg, inputs, draft, progress)
+    _film(cfg, inputs, draft, progress, records)
+    summary = summarise(records)
+    plain = [{k: v for k, v in r.items() if k not in ("video", "filmstrip")} for r in records]
+    _write(draft.path / "summary.json", summary)
+    _write(draft.path / "records.json", plain)
+    policy = inputs["policy"].manifest
+    result = {
+        **summary,
+        "records": records,
+        "config": {"evaluation": _plain(cfg.evaluation), "seed": cfg.seed},
+        "provenance": {"policy": policy.ref, "assets": inputs["assets"].manifest.ref, "code": policy.code_digest[:12]},
+    }
+    if (curve := inputs["policy"].path / "curve.json").is_file():
+        result["curves"] = _curves(json.loads(curve.read_text()), policy.kind)
+    write_page(draft.path / "report.html", result, embed_mb=cfg.evaluation.embed_mb)
+    draft.metrics |= summary
+
+
+def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[dict[str, Any]]:
+    """Play what is missing; a finished block is a file in the scratch folder, from which an interrupted run goes on."""
+    from wbm.envs.world import WorldConfig
+    from wbm.learning.evaluation import BlockJob
+    from wbm.learning.workers import run_jobs
+
+    e, policy = cfg.evaluation, inputs["policy"]
+    world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
+    blocks = draft.scratch / "blocks"
+    blocks.mkdir(parents=True, exist_ok=True)
+    jobs = [
+        BlockJob(
+            first, min(BLOCK, e.episodes - first), blocks, inputs["assets"].path, policy.path,
+            policy.manifest.kind, world,
+            cfg.sensors, e.split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
+            cfg.seed + e.seed,
+        )
+        for first in range(0, e.episodes, BLOCK)
+    ]  # fmt: skip
+    waiting = [job for job in jobs if not _block(blocks, job.first).is_file()]
+    with progress.task("episodes", total=e.episodes) as task:
+        task.update(e.episodes - sum(job.count for job in waiting))
+        for result in run_jobs("wbm.learning.evaluation", waiting, e.workers):
+            _write(_block(blocks, result.first), result.records)
+            won = sum(r["success"] for r in result.records)
+            task.update(len(result.records), success=won / len(result.records))
+    return [r for job in jobs for r in json.loads(_block(blocks, job.first).read_text())]
+
+
+def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: list[dict[str, Any]]) -> None:
+    """Film chosen episodes, draw strips of successes, and publish the recorded episodes, as Zarr and as MCAP."""
+    import shutil
+
+    import numpy as np
+
+    from wbm.artifacts.episode_reader import EpisodeReader, shard_paths
+    from wbm.report.films import FilmStudio, Trajectory, choose_films
+    from wbm.report.tracks import scene_solids, write_episode_mcap
+    from wbm.robot.schema import PolicySchema
+    from wbm.scenes.assets import load_assets
+
+    e, blocks = cfg.evaluation, draft.scratch / "blocks"
+    assets, period = load_assets(inputs["assets"].path), 1.0 / PolicySchema().rate_hz
+    chosen = choose_films(records, e.videos)
+    strips = [i for i, r in enumerate(records) if r["success"]][: e.filmstrips]
+    if chosen or strips:
+        studio = FilmStudio(assets, (e.video_width, e.video_height))
+        folder = draft.path / "videos"
+        folder.mkdir(exist_ok=True)
+        for i in progress.track(sorted({*chosen, *strips}), "films"):
+            record = records[i]
+            number, row = record["episode"], record["scene_row"]
+            with np.load(blocks / f"block-{number // BLOCK * BLOCK:05d}.npz") as data:
+                names = ("q", "pose", "phase", "held")
+                trajectory = Trajectory(*(data[f"{name}_{number}"] for name in names))
+            stem = folder / f"episode-{number:04d}"
+            if i in chosen:
+                studio.film(row, trajectory, stem.with_suffix(".mp4"), period, e.video_fps)
+                record["video"] = f"videos/{stem.name}.mp4"
+            if i in strips:
+                record["filmstrip"] = studio.strip(row, trajectory, stem, period)
+    if (blocks / "episodes").is_dir():
+        shutil.copytree(blocks / "episodes", draft.path / "episodes", dirs_exist_ok=True)
+        for path in shard_paths(draft.path / "episodes"):
+            schema = PolicySchema.from_dict(EpisodeReader(path).schema)
+            reader = EpisodeReader(path, schema)
+            for i, info in enumerate(reader.episodes):
+                target = draft.path / "mcap" / f"episode-{info.seed:04d}.mcap"
+                target.parent.mkdir(exist_ok=True)
+                write_episode_mcap(target, reader.read_episode(i), schema, scene_solids(assets, int(info.scene)))
+
+
+def _curves(curve: Any, kind: str) -> dict[str, Any]:
+    """The policy's learning curve as the page draws it: one panel a quantity."""
+    rows = curve if isinstance(curve, list) else curve.get("rows", [])
+    steps_of = lambda row: row.get("step", row.get("iteration", row.get("env_steps", 0)))
+    panels = {}
+    for key in ("train_loss", "reward", "success", "evaluation"):
+        kept = [(steps_of(r), r[key]) for r in rows if isinstance(r, dict) and r.get(key) is not None]
+        if len(kept) > 1:
+            steps, values = zip(*kept, strict=True)
+            panels[f"{kind} {key}"] = {kind: {"steps": list(steps), "values": [list(values)]}}
+    return panels
+
+
+def _block(folder: Path, first: int) -> Path:
+    return folder / f"block-{first:05d}.json"
+
+
+def _plain(settings: Any) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(settings)
+
+
+def _write(path: Path, value: Any) -> None:
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    partial.replace(path)

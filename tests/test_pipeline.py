@@ -1,0 +1,94 @@
+"""The whole pipeline as a user runs it: six stages from one command, then nothing to do, then one setting changed."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.pipeline, pytest.mark.slow]
+
+SMALL = [
+    "profile=smoke",
+    "objects.count=16",
+    "scenes.count=4",
+    "scenes.test_count=2",
+    "teachers=[top_down]",
+    "teacher.iterations=2",
+    "teacher.eval_every=2",
+    "teacher.num_envs=16",
+    "rollouts.episodes=4",
+    "rollouts.num_envs=4",
+    "distill.iterations=20",
+    "evaluation.episodes=2",
+    "evaluation.videos=1",
+    "evaluation.filmstrips=0",
+]
+
+
+def wbm(*arguments: str, root: Path) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-m", "stages.cli", *arguments, f"artifacts.root={root}"],
+        capture_output=True,
+        text=True,
+        timeout=400,
+        cwd=Path(__file__).parents[1],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("store")
+    done = wbm("run", *SMALL, root=folder)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return folder
+
+
+def test_every_kind_is_published_and_intact(root):
+    for kind in ("assets", "teacher", "rollouts", "student", "evaluation", "bundle"):
+        assert list((root / kind).glob("*/*/manifest.json")), kind
+    assert wbm("artifacts", "verify", root=root).returncode == 0
+
+
+def test_the_report_and_the_bundle_hold_what_the_run_made(root):
+    folder = next((root / "evaluation").glob("*/*/report.html")).parent
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["episodes"] == 2
+    assert len(json.loads((folder / "records.json").read_text())) == 2
+    assert "data:video/mp4" in (folder / "report.html").read_text()
+    manifest = json.loads(next((root / "bundle").glob("*/*/manifest.json")).read_text().splitlines()[0])
+    assert manifest["metrics"]["parity"] <= 1e-5
+
+
+def test_a_second_run_has_nothing_to_do(root):
+    assert wbm("plan", "--check", *SMALL, root=root).returncode == 0
+    again = wbm("run", *SMALL, root=root)
+    assert again.returncode == 0
+    assert "running" not in again.stderr
+
+
+def test_one_setting_reruns_what_reads_it(root):
+    plan = wbm("plan", "--json", *SMALL, "distill.lr=2e-3", root=root)
+    entries = {entry["stage"]: entry for entry in json.loads(plan.stdout)["stages"]}
+    stale = {name for name, entry in entries.items() if entry["reasons"]}
+    assert stale == {"distill", "evaluate", "deploy-export"}
+    assert "distill.lr" in " ".join(entries["distill"]["reasons"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["run", "distil.lr=1"], 2, "distill"),
+        (["distill", "distill.lr=fast"], 2, "distill.lr"),
+        (["evaluate", "profile=smoke", "policy=student/nobody"], 1, "student/nobody"),
+        (["prepare-assets", "objects=meshes", "objects.path=/nowhere"], 1, "/nowhere"),
+    ],
+)
+def test_bad_input_is_one_clear_line(arguments, code, says, tmp_path):
+    result = wbm(*arguments, root=tmp_path / "store")
+    assert result.returncode == code, result.stderr
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
