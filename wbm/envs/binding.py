@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from wbm.scenes.bank import SceneBank, obstacle_boxes
-from wbm.scenes.config import KINDS
 from wbm.scenes.model import SceneModel
 from wbm.sim.simulation import Simulation
 
@@ -109,16 +108,3 @@ class SceneBinding:
             obstacle_pos=tensor(pos),
             obstacle_quat=tensor(quat),
         )
-
-
-def choose_scenes(bank: SceneBank, split: str, supports: tuple[str, ...], grasp: str) -> np.ndarray:
-    """Scenes of a split and of some support kinds whose hint is the given grasp.
-
-    Raises:
-        ValueError: none is left.
-    """
-    rows = bank.where(split, tuple(KINDS.index(s) for s in supports))
-    rows = rows[bank.approach[rows] == ("top_down", "side").index(grasp)]
-    if len(rows) == 0:
-        raise ValueError(f"the assets hold no {split} scene on {', '.join(supports)} for a {grasp} grasp")
-    return rows

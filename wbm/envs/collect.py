@@ -38,8 +38,8 @@ def injected_noise(cfg: NoiseConfig, seed: int) -> Callable[[np.ndarray, int], n
     def draw(episodes: np.ndarray, steps: int) -> np.ndarray:
         out = np.zeros((len(episodes), steps, joints.NUM_JOINTS), dtype=np.float32)
         for row, episode in zip(out, episodes, strict=True):
-            rng = np.random.default_rng([seed, int(episode), 0x4015E])
-            level = noise_level(cfg, rng)
+            rng = _generator(seed, int(episode))
+            level = _draw_level(cfg, rng)
             if level == 0.0:
                 continue
             drive = rng.standard_normal(row.shape) * (cfg.innovation * level * scale)
@@ -52,8 +52,16 @@ def injected_noise(cfg: NoiseConfig, seed: int) -> Callable[[np.ndarray, int], n
     return draw
 
 
-def noise_level(cfg: NoiseConfig, rng: np.random.Generator) -> float:
-    """An episode's factor: the first draw of its generator."""
+def noise_level(cfg: NoiseConfig, seed: int, episode: int) -> float:
+    """Factor of the noise that `injected_noise` gives an episode."""
+    return _draw_level(cfg, _generator(seed, episode))
+
+
+def _generator(seed: int, episode: int) -> np.random.Generator:
+    return np.random.default_rng([seed, episode, 0x4015E])
+
+
+def _draw_level(cfg: NoiseConfig, rng: np.random.Generator) -> float:
     return float(cfg.levels[int(rng.integers(len(cfg.levels)))])
 
 

@@ -99,9 +99,9 @@ class RolloutWorld:
         )
 
     def level(self, episode: int) -> float:
-        """Factor of the noise injected into an episode; the same draw as `injected_noise` makes."""
+        """Factor of the noise injected into an episode."""
         seed = self.job.seed + self.job.rollouts.seed_offset
-        return noise_level(self.job.rollouts.noise, np.random.default_rng([seed, episode, 0x4015E]))
+        return noise_level(self.job.rollouts.noise, seed, episode)
 
     def describe(self, record: Record) -> dict[str, Any]:
         """Fields of an episode besides its steps."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from wbm.deploy.kinematics import mat_to_quat
+from wbm.sensors.poses import look_at
 
 RenderRgb = Callable[..., np.ndarray]
 """`render_rgb(scene, env, pos, quat, width, height, fov_deg)`: uint8 [height, width, 3] from a camera at `pos` (W, m)
@@ -58,15 +58,6 @@ def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> int
     if not count:
         raise ValueError(f"video {path}: no frames")
     return count
-
-
-def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Optical orientation (w x y z) of a camera at `eye` [3] that looks at `target` [3], upright (W's z up)."""
-    z = np.asarray(target, float) - np.asarray(eye, float)
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(x) < 1e-6 else x / np.linalg.norm(x)
-    return mat_to_quat(np.stack([x, np.cross(z, x), z], axis=1))
 
 
 def follow_camera(
