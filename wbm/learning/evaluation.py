@@ -75,8 +75,8 @@ class EvaluationWorld:
         physics = replace(EVALUATE, engine=job.world.sim.engine, threads=1)
         world = with_start(replace(job.world, sim=physics), job.start)
         rows = scene_rows(self.assets.scenes, job.split, KINDS, grasps)
-        self.env = make_env(self.assets, world, rows, job.num_envs, job.seed, job.device)
-        self.bank = self.assets.scenes.select(self.env.binding.scenes)
+        self.env = make_env(self.assets, world, rows, job.num_envs, job.seed, job.device, grasps=tuple(suite or ()))
+        self.bank = self.env.binding.bank.select(self.env.binding.scenes)
         phrasing = self.bank.text_held_out if job.split == "test" else self.bank.text
         self.sentence = phrasing[:, 0]
         perception, schema, texts = None, PolicySchema(), None
