@@ -15,7 +15,6 @@ from wbm.envs.pregrasp import StartBank, solve_starts
 from wbm.envs.whole_body import WholeBodyEnv
 from wbm.robot.config import MjcfOptions
 from wbm.robot.joints import NUM_JOINTS
-from wbm.robot.model import load_robot
 from wbm.scenes.assets import Assets
 from wbm.scenes.bank import SceneBank
 from wbm.scenes.config import KINDS
@@ -66,19 +65,20 @@ def make_env(
     Raises:
         ValueError: no scene has a reachable pre-grasp.
     """
-    robot, bank = load_robot(), assets.scenes
-    model = scene_model or SceneModel(assets.objects, SceneModelConfig(num_distractors=bank.num_distractors), cfg.robot)
+    bank = assets.scenes
+    template = SceneModelConfig(num_distractors=bank.num_distractors)
+    model = scene_model or SceneModel(assets.objects, template, cfg.robot, assets.robot)
     starts = find_starts(SceneBinding(model, bank, rows, device), cfg, seed, device)
     usable = starts.usable.cpu().numpy()
     binding = SceneBinding(model, bank, rows[usable], device)
     kept = StartBank(starts.q[starts.usable], starts.count[starts.usable])
     kind = WholeBodyEnv if cfg.env.start == "whole_body" else GraspEnv
-    return kind(binding, kept, robot, cfg.env, cfg.sim, cfg.wbc, num_envs, seed, device)
+    return kind(binding, kept, model.robot, cfg.env, cfg.sim, cfg.wbc, num_envs, seed, device)
 
 
 def find_starts(binding: SceneBinding, cfg: WorldConfig, seed: int, device: str) -> StartBank:
     """Pre-grasps of every scene, each by the approach that its record hints at."""
-    robot, approach = load_robot(), binding.bank.approach[binding.scenes]
+    robot, approach = binding.scene_model.robot, binding.bank.approach[binding.scenes]
     q = torch.zeros(len(approach), cfg.env.starts_per_scene, NUM_JOINTS, device=device)
     count = torch.zeros(len(approach), dtype=torch.int64, device=device)
     for code, grasp in enumerate(GRASPS):

@@ -161,10 +161,9 @@ def add_contact_sensors(spec: mujoco.MjSpec, target: str, distractors: Sequence[
     """
     body, subtree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
     rows: list[tuple[str, mujoco.mjtObj, str, str]] = []
-    for finger, prefix in joints.FINGER_PREFIX.items():
-        root = f"hand_{prefix}_{'mp' if prefix == 'th' else 'bs'}"
-        rows.append((f"tip_{finger}", body, f"hand_{prefix}_ds", target))
-        rows.append((f"finger_{finger}", subtree, root, target))
+    for finger in joints.FINGERS:
+        rows.append((f"tip_{finger}", body, joints.FINGER_TIP[finger], target))
+        rows.append((f"finger_{finger}", subtree, joints.FINGER_ROOT[finger], target))
     rows += [
         ("palm", body, "hand_palm", target),
         ("robot_target", subtree, "base", target),
@@ -189,7 +188,8 @@ def add_contact_sensors(spec: mujoco.MjSpec, target: str, distractors: Sequence[
 
 def robot_spec(options: MjcfOptions | None = None) -> mujoco.MjSpec:
     """A spec that holds the robot alone."""
+    options = options or MjcfOptions()
     spec = mujoco.MjSpec()
     spec.modelname = "wbm"
-    build_robot(spec, load_robot(), options)
+    build_robot(spec, load_robot(options.facts), options)
     return spec
