@@ -222,15 +222,21 @@ FilePath = Annotated[str, typer.Argument(metavar="PATH", help="A file or folder.
 
 
 @robot_app.command("show")
-def robot_show(debug: Debug = False, as_json: Json = False) -> None:
+def robot_show(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """Joints, limits, masses and spheres."""
-    _call("commands_robot", "robot_show", as_json)
+    _call("commands_robot", "robot_show", overrides or [], as_json)
 
 
 @robot_app.command("export")
-def robot_export(path: FilePath, debug: Debug = False) -> None:
+def robot_export(path: FilePath, overrides: Overrides = None, debug: Debug = False) -> None:
     """Write a standalone MJCF that opens in MuJoCo's viewer."""
-    _call("commands_robot", "robot_export", path)
+    _call("commands_robot", "robot_export", path, overrides or [])
+
+
+@robot_app.command("facts")
+def robot_facts(debug: Debug = False) -> None:
+    """Print the facts that robot.facts=FILE is laid over."""
+    _call("commands_robot", "robot_facts")
 
 
 @bundle_app.command("show")
@@ -291,7 +297,7 @@ def _exit_code(error: BaseException) -> int:
         return _complain("interrupted", 1)
     if kind == "ConfigError":
         return _complain(str(error), 2)
-    if kind in ("StageError", "Interrupted", "ArtifactError", "Missing", "Conflict"):
+    if kind in ("StageError", "FactsError", "Interrupted", "ArtifactError", "Missing", "Conflict"):
         return _complain(str(error), 1)
     text = " ".join(str(error).split())
     hint = "" if isinstance(error, OSError) else "; add --debug for the traceback"

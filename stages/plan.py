@@ -175,6 +175,8 @@ def _needed(nodes: list[Node]) -> list[Node]:
 def _node(stage: Stage, config: Config, overrides: tuple[str, ...], before: list[Node], store: Store) -> Node:
     sections = {name: plain(getattr(config, name), key_only=True) for name in stage.sections}
     view = SectionView(config, stage)
+    if outside := stage.outside(view):
+        sections["outside"] = outside
     name = stage.artifact_name(view)
     node = Node(stage, config, overrides, stage.kind, name, _code(stage.module), sections)
     for slot in stage.slots:

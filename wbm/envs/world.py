@@ -16,7 +16,6 @@ from wbm.envs.pregrasp import StartBank, solve_starts, target_of
 from wbm.envs.whole_body import WholeBodyEnv
 from wbm.robot.config import MjcfOptions
 from wbm.robot.joints import NUM_JOINTS
-from wbm.robot.model import load_robot
 from wbm.scenes.assets import Assets
 from wbm.scenes.bank import SceneBank
 from wbm.scenes.config import KINDS
@@ -67,8 +66,9 @@ def make_env(
     Raises:
         ValueError: no scene has a reachable pre-grasp.
     """
-    robot, bank = load_robot(), assets.scenes
-    model = scene_model or SceneModel(assets.objects, SceneModelConfig(num_distractors=bank.num_distractors), cfg.robot)
+    bank = assets.scenes
+    template = SceneModelConfig(num_distractors=bank.num_distractors)
+    model = scene_model or SceneModel(assets.objects, template, cfg.robot, assets.robot)
     tried = SceneBinding(model, bank, rows, device)
     starts, approach = find_starts(tried, cfg, seed, device, grasps)
     usable = starts.usable.cpu().numpy()
@@ -77,7 +77,7 @@ def make_env(
     binding = SceneBinding(model, bank, rows[usable], device)
     kept = StartBank(starts.q[starts.usable], starts.count[starts.usable])
     kind = WholeBodyEnv if cfg.env.start == "whole_body" else GraspEnv
-    return kind(binding, kept, robot, cfg.env, cfg.sim, cfg.wbc, num_envs, seed, device)
+    return kind(binding, kept, model.robot, cfg.env, cfg.sim, cfg.wbc, num_envs, seed, device)
 
 
 def find_starts(
@@ -108,7 +108,7 @@ def find_starts(
                 continue
             some = SceneBinding(binding.scene_model, binding.bank, binding.scenes[part], device)
             try:
-                bank = solve_starts(some.table, load_robot(), cfg.wbc, cfg.env, grasp, seed, device)
+                bank = solve_starts(some.table, binding.scene_model.robot, cfg.wbc, cfg.env, grasp, seed, device)
             except ValueError:
                 continue
             q[code, part], found[code, part], room[code, part] = bank.q, bank.count, bank.clearance

@@ -17,7 +17,6 @@ from wbm.envs.perception import Perception
 from wbm.envs.world import GRASPS, WorldConfig, make_env, scene_rows, with_start
 from wbm.learning.router import RoutedTeacher, load_suite
 from wbm.learning.student import load_student
-from wbm.robot.model import load_robot
 from wbm.robot.schema import PolicySchema
 from wbm.scenes.assets import load_assets
 from wbm.scenes.config import KINDS
@@ -82,7 +81,7 @@ class EvaluationWorld:
         perception, schema, texts = None, PolicySchema(), None
         if job.kind != "teacher":
             perception = Perception(
-                load_robot(), self.assets.objects, self.bank, job.sensors, schema, job.num_envs, job.seed, job.device
+                self.env.robot, self.assets.objects, self.bank, job.sensors, schema, job.num_envs, job.seed, job.device
             )
             schema = perception.schema
             texts = torch.as_tensor(self.assets.texts.embedding[self.sentence], dtype=torch.float32, device=job.device)

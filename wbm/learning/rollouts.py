@@ -17,7 +17,6 @@ from wbm.envs.perception import Perception
 from wbm.envs.rollout_config import RolloutsConfig
 from wbm.envs.world import GRASPS, WorldConfig, make_env, scene_rows, with_start
 from wbm.learning.router import RoutedTeacher, load_suite
-from wbm.robot.model import load_robot
 from wbm.robot.schema import PolicySchema
 from wbm.scenes.assets import Assets, load_assets
 from wbm.scenes.config import KINDS
@@ -76,7 +75,7 @@ class RolloutWorld:
         self.bank = self.env.binding.bank.select(self.env.binding.scenes)
         self.teacher = RoutedTeacher(suite, self.env)
         self.perception = Perception(
-            load_robot(),
+            self.env.robot,
             self.assets.objects,
             self.bank,
             job.sensors,
