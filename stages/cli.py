@@ -43,7 +43,7 @@ Items = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="[ARTIFACT]... [artifacts.root=DIR]",
-        help="kind/name[/key] or reference/name.",
+        help="kind/name[/key] or reference[/name].",
         show_default=False,
     ),
 ]
@@ -53,6 +53,9 @@ Multi = Annotated[bool, typer.Option("-m", "--multirun", help="Sweep: a,b and ra
 Launcher = Annotated[str, typer.Option("--launcher", help="Where to run: local or slurm.")]
 Detach = Annotated[bool, typer.Option("--detach", help="Submit and return at once.")]
 Force = Annotated[bool, typer.Option("--force", help="Run even if up to date, from the beginning.")]
+Source = Annotated[
+    str | None, typer.Option("--from", metavar="reference", help="Let reference results stand in for long stages.")
+]
 Until = Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
@@ -78,12 +81,13 @@ def run(
     detach: Detach = False,
     force: Force = False,
     until: Until = None,
+    source: Source = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """Run all six stages, skipping what is up to date."""
     _run(None, overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach, force=force,
-         until=until, as_json=as_json)  # fmt: skip
+         until=until, source=source, as_json=as_json)  # fmt: skip
 
 
 def _add_stage(name: str, text: str) -> None:
@@ -95,11 +99,12 @@ def _add_stage(name: str, text: str) -> None:
         launcher: Launcher = "local",
         detach: Detach = False,
         force: Force = False,
+        source: Source = None,
         debug: Debug = False,
         as_json: Json = False,
     ) -> None:
         _run(name, overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach, force=force,
-             as_json=as_json)  # fmt: skip
+             source=source, as_json=as_json)  # fmt: skip
 
     command.__doc__ = text
     app.command(name)(command)
@@ -114,11 +119,12 @@ def plan(
     overrides: Overrides = None,
     check: Annotated[bool, typer.Option("--check", help="Exit with 3 when a stage would run.")] = False,
     until: Until = None,
+    source: Source = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """Say which stages would run, and why."""
-    _call("commands", "plan_command", overrides or [], check, as_json, until)
+    _call("commands", "plan_command", overrides or [], check, as_json, until, source)
 
 
 @app.command("repro-diff")
@@ -216,6 +222,19 @@ def pin(
 def rm(items: Items = None, force: Force = False, debug: Debug = False, as_json: Json = False) -> None:
     """Delete an artifact that nothing was made from."""
     _call("commands_artifacts", "rm", items or [], force, as_json)
+
+
+@artifacts_app.command()
+def publish(
+    items: Items = None,
+    name: Annotated[str | None, typer.Option("--as", metavar="NAME", help="Default: the kind, or kind_name.")] = None,
+    without: Annotated[list[str] | None, typer.Option("--without", metavar="PATTERN", help="Leave files out.")] = None,
+    limit: Annotated[float, typer.Option("--limit-mb", help="Largest size of all reference results, MB.")] = 20.0,
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """Copy one to the reference results, to be committed."""
+    _call("commands_artifacts", "publish", items or [], name, without or [], limit, as_json)
 
 
 FilePath = Annotated[str, typer.Argument(metavar="PATH", help="A file or folder.")]
