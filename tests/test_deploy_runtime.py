@@ -80,7 +80,7 @@ def test_action_holds_the_action_before(bundle):
         np.testing.assert_array_equal(runtime.observation["prev_action"], previous)
         expected = forward({k: v[None] for k, v in runtime.observation.items()}, weights())[0]
         np.testing.assert_allclose(command.action, expected, atol=1e-5)
-        previous = to_increment(driver.q, command.q_target, SCHEMA.action).astype(np.float32)
+        previous = to_increment(np, driver.q, command.q_target, SCHEMA.action).astype(np.float32)
         driver.command(command)
 
 
