@@ -22,7 +22,9 @@ artifacts_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="L
 app.add_typer(artifacts_app, name="artifacts")
 robot_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The robot that everything is built on.")
 app.add_typer(robot_app, name="robot")
-bundle_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made.")
+bundle_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made, and try it out."
+)
 app.add_typer(bundle_app, name="bundle")
 
 STAGES = {
@@ -258,16 +260,49 @@ def robot_facts(debug: Debug = False) -> None:
     _call("commands_robot", "robot_facts")
 
 
+BundlePath = Annotated[str, typer.Argument(metavar="BUNDLE", help="A file, its folder, or bundle/NAME in the store.")]
+LogPath = Annotated[str, typer.Argument(metavar="LOG", help="A run's log, as RunLog wrote it (.mcap).")]
+Minutes = Annotated[float, typer.Option("--minutes", help="How long.")]
+RunLogPath = Annotated[str | None, typer.Option("--log", metavar="FILE", help="Also log as on a robot (MCAP).")]
+
+
 @bundle_app.command("show")
-def bundle_show(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+def bundle_show(path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """The contract and provenance of a bundle."""
-    _call("commands_robot", "bundle", path, False, as_json)
+    _call("commands_bundle", "show", path, overrides or [], as_json)
 
 
 @bundle_app.command("verify")
-def bundle_verify(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+def bundle_verify(path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """Check every part of a bundle, and its golden vectors."""
-    _call("commands_robot", "bundle", path, True, as_json)
+    _call("commands_bundle", "verify", path, overrides or [], as_json)
+
+
+@bundle_app.command("replay")
+def bundle_replay(
+    log: LogPath, path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False
+) -> None:
+    """Run a bundle on what another one saw, and compare the actions."""
+    _call("commands_bundle", "replay_log", log, path, overrides or [], as_json)
+
+
+@bundle_app.command("soak")
+def bundle_soak(
+    path: BundlePath,
+    overrides: Overrides = None,
+    minutes: Minutes = 10.0,
+    log: RunLogPath = None,
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """Closed loop in real time: deadlines, jitter, memory."""
+    _call("commands_bundle", "soak_bundle", path, overrides or [], minutes, log, as_json)
+
+
+@bundle_app.command("compare")
+def bundle_compare(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Evaluate a bundle and its student on the same seeds."""
+    _call("commands_bundle", "compare", overrides or [], as_json)
 
 
 Remote = Annotated[str, typer.Argument(metavar="URL", help="s3://bucket/prefix or a directory.")]
