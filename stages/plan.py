@@ -172,11 +172,15 @@ def _needed(nodes: list[Node]) -> list[Node]:
     return [node for node in nodes if id(node) in wanted]
 
 
-def _node(stage: Stage, config: Config, overrides: tuple[str, ...], before: list[Node], store: Store) -> Node:
+def make_node(stage: Stage, config: Config, overrides: Sequence[str] = (), name: str | None = None) -> Node:
+    """A stage under a configuration, without inputs yet; `name` in place of the stage's own name for its artifact."""
     sections = {name: plain(getattr(config, name), key_only=True) for name in stage.sections}
-    view = SectionView(config, stage)
-    name = stage.artifact_name(view)
-    node = Node(stage, config, overrides, stage.kind, name, _code(stage.module), sections)
+    name = name or stage.artifact_name(SectionView(config, stage))
+    return Node(stage, config, tuple(overrides), stage.kind, name, _code(stage.module), sections)
+
+
+def _node(stage: Stage, config: Config, overrides: tuple[str, ...], before: list[Node], store: Store) -> Node:
+    node = make_node(stage, config, overrides)
     for slot in stage.slots:
         text = config.inputs.get(slot.name) or (getattr(config, slot.name, None) if slot.name == "policy" else None)
         if text:

@@ -14,9 +14,9 @@ from report_synthetic import make_result, picture
 from scipy.stats import binomtest
 
 from wbm.report.config import EvaluationConfig
-from wbm.report.page import percent, write_page
+from wbm.report.page import write_page
 from wbm.report.plots import curves_figure, failure_figure, figure4, to_png, to_svg
-from wbm.report.stats import overlap, summarise, wilson
+from wbm.report.stats import overlap, percent, summarise, wilson
 from wbm.report.video import film_frame, follow_camera, key_steps, look_at, write_mp4
 from wbm.robot.proprio import quat_to_mat
 

@@ -12,6 +12,7 @@ from wbm.envs.binding import SceneBinding
 from wbm.envs.config import EnvConfig
 from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.pregrasp import StartBank, solve_starts
+from wbm.envs.seen_env import SeenEnv
 from wbm.envs.whole_body import WholeBodyEnv
 from wbm.robot.config import MjcfOptions
 from wbm.robot.joints import NUM_JOINTS
@@ -72,8 +73,11 @@ def make_env(
     usable = starts.usable.cpu().numpy()
     binding = SceneBinding(model, bank, rows[usable], device)
     kept = StartBank(starts.q[starts.usable], starts.count[starts.usable])
-    kind = WholeBodyEnv if cfg.env.start == "whole_body" else GraspEnv
-    return kind(binding, kept, robot, cfg.env, cfg.sim, cfg.wbc, num_envs, seed, device)
+    env = cfg.env
+    kind = WholeBodyEnv if env.start == "whole_body" else GraspEnv
+    if env.observe == "seen":
+        kind, env = SeenEnv, env if env.start == "whole_body" else replace(env, pregrasp_share=1.0)
+    return kind(binding, kept, robot, env, cfg.sim, cfg.wbc, num_envs, seed, device)
 
 
 def find_starts(binding: SceneBinding, cfg: WorldConfig, seed: int, device: str) -> StartBank:
