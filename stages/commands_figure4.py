@@ -22,6 +22,7 @@ from stages.tables import seconds, table
 from wbm.artifacts.errors import ArtifactError, Conflict
 from wbm.artifacts.store import Store
 
+_SELDOM = 0.05
 _SET_HERE = ("env", "policy", "figure4.arm", "figure4.seed")
 
 
@@ -59,7 +60,7 @@ def build(overrides: Sequence[str], store: Store) -> Sweep:
                 sweep.runs[f"rl/{arm}/{seed}"] = _rl_run(sweep, arm, seed, overrides)
     if figure.reading in ("student", "both"):
         for arm in figure.arms:
-            sweep.runs[f"student/{arm}"] = _student(sweep, arm, overrides)
+            sweep.runs[f"student/{arm}"] = _student(sweep, arm, overrides, store)
     node = make_node(registry.load("figure4"), composer(overrides), overrides)
     node.upstream = dict(sweep.runs)
     sweep.nodes.append(node)
@@ -86,7 +87,7 @@ def _rl_run(sweep: Sweep, arm: str, seed: int, overrides: Sequence[str]) -> Node
     return node
 
 
-def _student(sweep: Sweep, arm: str, overrides: Sequence[str]) -> Node:
+def _student(sweep: Sweep, arm: str, overrides: Sequence[str], store: Store) -> Node:
     """The evaluation of an arm's student, with the nodes it needs.
 
     The full arm is the pipeline's own student. Without active vision the same teachers (they know the target's pose
@@ -98,9 +99,12 @@ def _student(sweep: Sweep, arm: str, overrides: Sequence[str]) -> Node:
     assets = _of_kind(sweep, "assets")
     lines = [*overrides, f"env={arm}"]
     if arm == "joint_space":
-        made_by = [_rl_run(sweep, arm, 0, overrides)]
-        # A policy that hardly ever succeeds leaves too few trajectories: the student then imitates all of them.
-        rolled = [*lines, "env.observe=seen", "rollouts.keep=all"]
+        policy = _rl_run(sweep, arm, 0, overrides)
+        planning.plan([assets, policy], store)
+        rate = policy.done.metrics["success_rate"] if policy.done else 0.0
+        # Of a policy that hardly ever succeeds the student imitates all trajectories: the successes are too few.
+        rolled = [*lines, "env.observe=seen", *(["rollouts.keep=all"] if rate < _SELDOM else [])]
+        made_by = [policy]
     else:
         made_by, rolled = [node for node in sweep.nodes if node.stage.name == "train-teacher"], lines
     rollouts = make_node(registry.load("generate-rollouts"), composer(rolled), rolled, arm)
@@ -123,30 +127,47 @@ def figure4_command(overrides: Sequence[str], force: bool = False, as_json: bool
         StageError: runs failed, or are still being made elsewhere.
     """
     store, progress = open_store(composer(overrides)), Progress()
-    sweep = build(overrides, store)
-    failed: dict[str, None] = {}
-    elsewhere: dict[str, None] = {}
-    for node in sweep.nodes:
-        planning.look_up(node, store)
-        if any(manifest is None for manifest in node.inputs.values()):
-            continue  # what it needs failed or is being made elsewhere
-        try:
-            run_node(node, store, progress, force=force and node in [*sweep.runs.values(), sweep.figure])
-        except Conflict:
-            elsewhere[node.ref] = None
-        except (StageError, ArtifactError) as error:
-            failed[node.ref] = None
-            progress.message(f"wbm: {error}")
+    sweep, report = build(overrides, store), Report()
+    learned = [node for node in sweep.nodes if node.stage.name in ("prepare-assets", "figure4-run")]
+    _work(learned, store, progress, force, report)
+    if composer(overrides).figure4.reading != "rl":
+        sweep = build(overrides, store)  # how a student is made depends on how its arm's policy came out
+        planning.plan(sweep.nodes, store)
+    refs = {node.ref for node in learned}
+    _work([node for node in sweep.nodes if node.ref not in refs], store, progress, force, report)
     figure = sweep.figure.done
     if figure is None:
-        parts = [f"{len(failed)} failed ({', '.join(failed)})"] if failed else []
-        parts += [f"{len(elsewhere)} are being made by another process"] if elsewhere else []
+        parts = [f"{len(report.failed)} failed ({', '.join(report.failed)})"] if report.failed else []
+        parts += [f"{len(report.elsewhere)} are being made by another process"] if report.elsewhere else []
         raise StageError(f"figure4: {' and '.join(parts)}; run the same command again to continue")
     folder = store.resolve(figure.ref).path
     if as_json:
         emit({"artifact": figure.ref, **json.loads((folder / "figure4.json").read_text())})
     else:
         _print(json.loads((folder / "figure4.json").read_text()), folder)
+
+
+@dataclass
+class Report:
+    """Artifacts that failed, and those that another process is making."""
+
+    failed: list[str] = field(default_factory=list)
+    elsewhere: list[str] = field(default_factory=list)
+
+
+def _work(nodes: Sequence[Node], store: Store, progress: Progress, force: bool, report: Report) -> None:
+    """Run the nodes in order; one that fails does not stop the others."""
+    for node in nodes:
+        planning.look_up(node, store)
+        if any(manifest is None for manifest in node.inputs.values()):
+            continue  # what it needs failed or is being made elsewhere
+        try:
+            run_node(node, store, progress, force=force and node.stage.name in registry.FIGURE4)
+        except Conflict:
+            report.elsewhere.append(node.ref)
+        except (StageError, ArtifactError) as error:
+            report.failed.append(node.ref)
+            progress.message(f"wbm: {error}")
 
 
 def _print(figure: dict[str, Any], folder: Path) -> None:

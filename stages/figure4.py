@@ -43,13 +43,10 @@ def _read(slot: str, artifact: Any) -> dict[str, Any]:
     """An input as `wbm.report.figure4.Run` takes it."""
     reading, arm, *seed = slot.split("/")
     curve = artifact.path / "curve.json"
-    manifest = artifact.manifest
     return {
         "reading": reading,
         "arm": arm,
         "seed": int(seed[0]) if seed else 0,
         "records": json.loads((artifact.path / "records.json").read_text()),
         "curve": json.loads(curve.read_text()) if reading == "rl" and curve.is_file() else None,
-        "wall_time_s": manifest.wall_time_s,
-        "train_seconds": manifest.metrics.get("train_seconds"),
     }
