@@ -85,7 +85,7 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
     import numpy as np
 
     from wbm.artifacts.episode_reader import EpisodeReader, shard_paths
-    from wbm.report.films import FilmStudio, Trajectory, choose_films
+    from wbm.report.films import FilmStudio, Trajectory, choose_films, choose_strips
     from wbm.report.tracks import scene_solids, write_episode_mcap
     from wbm.robot.schema import PolicySchema
     from wbm.scenes.assets import load_assets
@@ -93,7 +93,7 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
     e, blocks = cfg.evaluation, draft.scratch / "blocks"
     assets, period = load_assets(inputs["assets"].path), 1.0 / PolicySchema().rate_hz
     chosen = choose_films(records, e.videos)
-    strips = [i for i, r in enumerate(records) if r["success"]][: e.filmstrips]
+    strips = choose_strips(records, e.filmstrips)
     if chosen or strips:
         studio = FilmStudio(assets, (e.video_width, e.video_height))
         folder = draft.path / "videos"

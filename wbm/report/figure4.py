@@ -168,5 +168,5 @@ def _panels(reading: dict[str, Any]) -> list[Any]:
     panels = list(figure4_panels(reading["arms"]))
     if all(a.get("success_curve") for a in reading["arms"]):
         curves = {a["key"]: a["success_curve"] for a in reading["arms"]}
-        panels.append(curves_figure(curves, "success of training episodes"))
+        panels.append(curves_figure(curves, "success of training episodes", "environment steps"))
     return panels

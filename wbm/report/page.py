@@ -111,7 +111,13 @@ def _lead(result: dict[str, Any]) -> str:
     policy = result.get("provenance", {}).get("policy", "The policy")
     where = result.get("config", {}).get("evaluation", {}).get("split")
     on = {"test": " that it has not been trained on", "train": " that it has been trained on"}.get(where, "")
-    return f"{policy} on {len(result['by_object'])} objects{on}, in {len(result['by_scene'])} kinds of scene."
+    count = len({r["object_name"] for r in result.get("records", []) if "object_name" in r})
+    what = (
+        f"{count} objects{on} ({', '.join(result['by_object'])})"
+        if count
+        else f"{len(result['by_object'])} objects{on}"
+    )
+    return f"{policy} on {what}, in {len(result['by_scene'])} kinds of scene ({', '.join(result['by_scene'])})."
 
 
 def _worst_first(groups: dict[str, Any]) -> dict[str, Any]:

@@ -203,11 +203,11 @@ def _arm_curves(arms: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {a["key"]: a["curve"] for a in arms if a.get("curve")}
 
 
-def curves_figure(curves: dict[str, dict[str, Any]], ylabel: str) -> Figure:
+def curves_figure(curves: dict[str, dict[str, Any]], ylabel: str, xlabel: str = "steps") -> Figure:
     """Training curves of one quantity."""
     with matplotlib.rc_context(_STYLE):
         figure, ax = _figure(4.9, 3.0)
-        draw_curves(ax, curves, ARM_COLOURS, "steps", ylabel)
+        draw_curves(ax, curves, ARM_COLOURS, xlabel, ylabel)
     return figure
 
 

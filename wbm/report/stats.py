@@ -119,7 +119,8 @@ def verdict(name: str, arms: Sequence[dict[str, Any]]) -> list[str]:
         return []
     ranked = sorted(arms, key=lambda a: -a["success_rate"])
     order = ", ".join(f"{a['label'].lower()} {percent(a['success_rate'])}" for a in ranked)
-    expected = [a["key"] for a in ranked] == list(PAPER_SUCCESS)
+    rates = [by_key[key]["success_rate"] for key in PAPER_SUCCESS]
+    expected = all(better > worse for better, worse in itertools.pairwise(rates))
     apart = not any(overlap(a["success_ci95"], b["success_ci95"]) for a, b in itertools.pairwise(ranked))
     lead = f"{name}: {order}." if name else f"{order.capitalize()}."
     if expected and apart:
