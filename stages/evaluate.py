@@ -57,13 +57,17 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
 
     e, policy = cfg.evaluation, inputs["policy"]
     world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
+    split = e.split
+    if split == "test" and _strange(inputs["assets"].manifest, policy.manifest, draft.store):
+        split = "all"
+        progress.message("nobody trained on these objects: evaluating on all of them")
     blocks = draft.scratch / "blocks"
     blocks.mkdir(parents=True, exist_ok=True)
     jobs = [
         BlockJob(
             first, min(BLOCK, e.episodes - first), blocks, inputs["assets"].path, policy.path,
             policy.manifest.kind, world,
-            cfg.sensors, e.split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
+            cfg.sensors, split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
             cfg.seed + e.seed,
         )
         for first in range(0, e.episodes, BLOCK)
@@ -76,6 +80,27 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
             won = sum(r["success"] for r in result.records)
             task.update(len(result.records), success=won / len(result.records))
     return [r for job in jobs for r in json.loads(_block(blocks, job.first).read_text())]
+
+
+def _strange(assets: Any, policy: Any, store: Any) -> bool:
+    """Whether the assets hold imported objects and the policy was trained on other assets."""
+    from wbm.artifacts.errors import ArtifactError
+
+    if assets.config.get("objects", {}).get("source") not in ("meshes", "pybullet"):
+        return False
+    waiting, known = list(policy.inputs.values()), False
+    while waiting:
+        ref = waiting.pop()
+        if ref.ref.startswith("assets/"):
+            if ref.content_digest == assets.content_digest:
+                return False
+            known = True
+            continue
+        try:
+            waiting += store.manifest(ref.ref).inputs.values()
+        except ArtifactError:
+            return False  # what it was trained on is no longer known
+    return known
 
 
 def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: list[dict[str, Any]]) -> None:
