@@ -60,6 +60,9 @@ Source = Annotated[
 ]
 Until = Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Figure4 = Annotated[
+    bool, typer.Option("--figure4", help="The paper's three arms instead, every seed; continues where it stopped.")
+]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 
 
@@ -112,8 +115,36 @@ def _add_stage(name: str, text: str) -> None:
     app.command(name)(command)
 
 
+def _add_evaluate(text: str) -> None:
+    def command(
+        overrides: Overrides = None,
+        figure4: Figure4 = False,
+        cfg: Cfg = False,
+        info: Info = False,
+        multirun: Multi = False,
+        launcher: Launcher = "local",
+        detach: Detach = False,
+        force: Force = False,
+        debug: Debug = False,
+        as_json: Json = False,
+    ) -> None:
+        if figure4:
+            if cfg or info or multirun or detach or launcher != "local":
+                raise typer.BadParameter("--figure4 goes with --force, --debug and --json alone")
+            _call("commands_figure4", "figure4_command", overrides or [], force, as_json)
+            return
+        _run("evaluate", overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach,
+             force=force, as_json=as_json)  # fmt: skip
+
+    command.__doc__ = text
+    app.command("evaluate")(command)
+
+
 for _name, _text in STAGES.items():
-    _add_stage(_name, _text)
+    if _name == "evaluate":
+        _add_evaluate(_text)
+    else:
+        _add_stage(_name, _text)
 
 
 @app.command()
@@ -122,11 +153,15 @@ def plan(
     check: Annotated[bool, typer.Option("--check", help="Exit with 3 when a stage would run.")] = False,
     until: Until = None,
     source: Source = None,
+    figure4: Figure4 = False,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """Say which stages would run, and why."""
-    _call("commands", "plan_command", overrides or [], check, as_json, until, source)
+    if figure4:
+        _call("commands_figure4", "figure4_plan", overrides or [], check, as_json)
+    else:
+        _call("commands", "plan_command", overrides or [], check, as_json, until, source)
 
 
 @app.command("repro-diff")

@@ -20,10 +20,10 @@ from wbm.artifacts.digest import digest_bytes, digest_file, digest_value
 ROOTS = ("wbm", "stages")
 # They carry bytes and settings from place to place and leave no trace in a result.
 TRANSPARENT = {
-    "stages.bench", "stages.cli", "stages.code", "stages.commands", "stages.commands_artifacts", "stages.completion",
-    "stages.compose", "stages.config", "stages.convert", "stages.doctor", "stages.pipeline", "stages.plan",
-    "stages.progress", "stages.provenance", "stages.reasons", "stages.registry", "stages.submit", "stages.tables",
-    "stages.view",
+    "stages.bench", "stages.cli", "stages.code", "stages.commands", "stages.commands_artifacts",
+    "stages.commands_figure4", "stages.completion", "stages.compose", "stages.config", "stages.convert",
+    "stages.doctor", "stages.pipeline", "stages.plan", "stages.progress", "stages.provenance", "stages.reasons",
+    "stages.registry", "stages.submit", "stages.tables", "stages.view",
     "wbm.artifacts.backend", "wbm.artifacts.config", "wbm.artifacts.errors", "wbm.artifacts.lease",
     "wbm.artifacts.lineage", "wbm.artifacts.manifest", "wbm.artifacts.migrate", "wbm.artifacts.reference",
     "wbm.artifacts.remote", "wbm.artifacts.shards", "wbm.artifacts.store", "wbm.artifacts.transfer",

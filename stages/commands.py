@@ -95,7 +95,9 @@ def run_command(options: Options) -> None:
     else:
         outcomes = run_once(options, runs[0])
         if options.as_json:
-            emit(_document(outcomes))
+            # An evaluation's numbers are what a script asks for: they stand at the top.
+            numbers = outcomes[-1].manifest.metrics if options.stage == "evaluate" else {}
+            emit({**numbers, **_document(outcomes)})
         else:
             sys.stdout.write(results_table(outcomes))
 
@@ -136,6 +138,10 @@ def run_once(options: Options, overrides: Sequence[str]) -> list[Outcome]:
     for node in nodes:
         planning.look_up(node, store, use_latest=node is nodes[-1])
     for upstream in nodes[:-1]:
+        if upstream.kind == "assets" and options.stage == "evaluate" and _other_world(upstream, store):
+            run_node(upstream, store, progress)
+            planning.look_up(nodes[-1], store, use_latest=True)
+    for upstream in nodes[:-1]:
         if upstream.stale and store.latest(upstream.kind, upstream.name):
             reasons = because(upstream.reasons)
             progress.message(f"note: input {upstream.ref} is not up to date ({reasons}); using the newest")
@@ -148,6 +154,12 @@ def _announce(nodes: Sequence[planning.Node], store: Store, progress: Progress) 
     for text in store.references.names():
         if (ref := store.references.get(text).ref) in used:
             progress.message(f"{text} is used as {ref}")
+
+
+def _other_world(assets: planning.Node, store: Store) -> bool:
+    """Whether the assets that are asked for differ in their settings from the newest: those would not do in place."""
+    newest = store.latest(assets.kind, assets.name)
+    return assets.stale and (newest is None or newest.config != assets.sections)
 
 
 def _sweep(options: Options, composed: Sequence[Composed]) -> None:

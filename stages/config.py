@@ -14,6 +14,7 @@ from wbm.deploy.config import DeployConfig
 from wbm.envs.config import EnvConfig
 from wbm.envs.rollout_config import RolloutsConfig
 from wbm.learning.config import PpoConfig, TeacherConfig
+from wbm.learning.figure4_config import Figure4Config
 from wbm.learning.student_config import DistillConfig, StudentConfig
 from wbm.report.config import EvaluationConfig
 from wbm.robot.config import MjcfOptions
@@ -55,4 +56,5 @@ class Config:
     student: StudentConfig = field(default_factory=StudentConfig)
     distill: DistillConfig = field(default_factory=DistillConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    figure4: Figure4Config = field(default_factory=Figure4Config)
     deploy: DeployConfig = field(default_factory=DeployConfig)

@@ -74,13 +74,17 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
 
     e, policy = cfg.evaluation, inputs["policy"]
     world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
+    split = e.split
+    if split == "test" and _strange(inputs["assets"].manifest, policy.manifest, draft.store):
+        split = "all"
+        progress.message("nobody trained on these objects: evaluating on all of them")
     blocks = draft.scratch / "blocks"
     blocks.mkdir(parents=True, exist_ok=True)
     jobs = [
         BlockJob(
             first, min(BLOCK, e.episodes - first), blocks, inputs["assets"].path, policy.path,
             policy.manifest.kind, world,
-            cfg.sensors, e.split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
+            cfg.sensors, split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
             cfg.seed + e.seed,
         )
         for first in range(0, e.episodes, BLOCK)
@@ -95,6 +99,27 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
     return [r for job in jobs for r in json.loads(_block(blocks, job.first).read_text())]
 
 
+def _strange(assets: Any, policy: Any, store: Any) -> bool:
+    """Whether the assets hold imported objects and the policy was trained on other assets."""
+    from wbm.artifacts.errors import ArtifactError
+
+    if assets.config.get("objects", {}).get("source") not in ("meshes", "pybullet"):
+        return False
+    waiting, known = list(policy.inputs.values()), False
+    while waiting:
+        ref = waiting.pop()
+        if ref.ref.startswith("assets/"):
+            if ref.content_digest == assets.content_digest:
+                return False
+            known = True
+            continue
+        try:
+            waiting += store.manifest(ref.ref).inputs.values()
+        except ArtifactError:
+            return False  # what it was trained on is no longer known
+    return known
+
+
 def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: list[dict[str, Any]]) -> None:
     """Film chosen episodes, draw strips of successes, and publish the recorded episodes, as Zarr and as MCAP."""
     import shutil
@@ -102,7 +127,7 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
     import numpy as np
 
     from wbm.artifacts.episode_reader import EpisodeReader, shard_paths
-    from wbm.report.films import FilmStudio, Trajectory, choose_films
+    from wbm.report.films import FilmStudio, Trajectory, choose_films, choose_strips
     from wbm.report.tracks import scene_solids, write_episode_mcap
     from wbm.robot.schema import PolicySchema
     from wbm.scenes.assets import load_assets
@@ -110,7 +135,7 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
     e, blocks = cfg.evaluation, draft.scratch / "blocks"
     assets, period = load_assets(inputs["assets"].path), 1.0 / PolicySchema().rate_hz
     chosen = choose_films(records, e.videos)
-    strips = [i for i, r in enumerate(records) if r["success"]][: e.filmstrips]
+    strips = choose_strips(records, e.filmstrips)
     if chosen or strips:
         studio = FilmStudio(assets, (e.video_width, e.video_height))
         folder = draft.path / "videos"

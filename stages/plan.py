@@ -209,6 +209,16 @@ def _needed(nodes: list[Node], targets: Sequence[Node]) -> list[Node]:
     return [node for node in nodes if id(node) in wanted]
 
 
+def make_node(stage: Stage, config: Config, overrides: Sequence[str] = (), name: str | None = None) -> Node:
+    """A stage under a configuration, without inputs yet; `name` in place of the stage's own name for its artifact."""
+    sections = {name: plain(getattr(config, name), key_only=True) for name in stage.sections}
+    view = SectionView(config, stage)
+    if outside := stage.outside(view):
+        sections["outside"] = outside
+    name = name or stage.artifact_name(view)
+    return Node(stage, config, tuple(overrides), stage.kind, name, _code(stage.module), sections)
+
+
 def _node(
     stage: Stage,
     config: Config,
@@ -221,12 +231,7 @@ def _node(
 
     `stand_in` lists the kinds of inputs that are taken from the reference results where they have one.
     """
-    sections = {name: plain(getattr(config, name), key_only=True) for name in stage.sections}
-    view = SectionView(config, stage)
-    if outside := stage.outside(view):
-        sections["outside"] = outside
-    name = stage.artifact_name(view)
-    node = Node(stage, config, overrides, stage.kind, name, _code(stage.module), sections)
+    node = make_node(stage, config, overrides)
     asked = {slot.name: _asked(slot, config) for slot in stage.slots}
     if any(text and is_reference(text) for text in asked.values()):
         stand_in = KINDS  # the results belong together: a reference policy is judged on the reference scenes

@@ -28,6 +28,8 @@ MODULES: dict[str, str] = {
     "evaluate": "stages.evaluate",
     "deploy-export": "stages.deploy_export",
 }
+# Stages beside the pipeline: `wbm evaluate --figure4` runs them.
+FIGURE4: dict[str, str] = {"figure4-run": "stages.figure4_run", "figure4": "stages.figure4"}
 
 
 @dataclass(frozen=True)
@@ -68,10 +70,11 @@ def load(name: str) -> Stage:
         KeyError: no such stage.
         AttributeError: the module does not define what a stage must.
     """
-    module = importlib.import_module(MODULES[name])
+    where = (MODULES | FIGURE4)[name]
+    module = importlib.import_module(where)
     return Stage(
         name=name,
-        module=MODULES[name],
+        module=where,
         kind=module.KIND,
         sections=tuple(module.SECTIONS),
         slots=tuple(slot(text) for text in module.INPUTS),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from wbm.envs.seen_config import SeenConfig
+
 
 @dataclass(frozen=True)
 class ActionConfig:
@@ -61,6 +63,7 @@ class RewardConfig:
         drop: subtracted once when an episode ends early: dropped, out of reach or in a forbidden contact.
         scale: common factor, 1/step.
         reach_length: decay of the reaching term, m.
+        reach_far, reach_far_length: weight within the reaching term of a part that is felt from afar, and its decay, m.
         enclose: share of the enclosing shape beside the contact pattern in the grasp term.
         lift_open: share of the lift term that is paid without opposition.
         goal_height: height above the settled height that the lift term asks for, m.
@@ -84,6 +87,8 @@ class RewardConfig:
     drop: float = 50.0
     scale: float = 0.02
     reach_length: float = 0.10
+    reach_far: float = 0.0
+    reach_far_length: float = 0.6
     enclose: float = 0.5
     lift_open: float = 0.25
     goal_height: float = 0.16
@@ -99,7 +104,7 @@ class RewardConfig:
     grip_force: float = 15.0
 
     def __post_init__(self) -> None:
-        lengths = ("reach_length", "goal_width", "overshoot_width", "drift_width")
+        lengths = ("reach_length", "reach_far_length", "goal_width", "overshoot_width", "drift_width")
         for name in (*lengths, "slip_speed", "spin_speed", "support_force"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"env.reward.{name} must be positive, not {getattr(self, name)}")
@@ -173,6 +178,8 @@ class EnvConfig:
         end_on_collision: end the episode at the first forbidden contact; else it is judged at the end.
         max_speed: object speed that means the physics is unstable, m/s.
         starts_per_scene: pre-grasp solutions kept for each scene.
+        observe: `privileged` (the teacher always knows the target's pose) or `seen` (only while the camera sees it).
+        seen: what `observe=seen` means.
     """
 
     start: str = "local"
@@ -196,6 +203,8 @@ class EnvConfig:
     end_on_collision: bool = True
     max_speed: float = 15.0
     starts_per_scene: int = 8
+    observe: str = "privileged"
+    seen: SeenConfig = field(default_factory=SeenConfig)
     action: ActionConfig = field(default_factory=ActionConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
@@ -203,6 +212,8 @@ class EnvConfig:
     def __post_init__(self) -> None:
         if self.start not in ("local", "whole_body"):
             raise ValueError(f"env.start is {self.start!r}; choose local or whole_body")
+        if self.observe not in ("privileged", "seen"):
+            raise ValueError(f"env.observe is {self.observe!r}; choose privileged or seen")
         if not 0.0 <= self.pregrasp_share <= 1.0:
             raise ValueError(f"env.pregrasp_share must be within 0 and 1, not {self.pregrasp_share}")
         if self.episode_s <= self.success_hold_s:

@@ -19,11 +19,11 @@ from wbm.envs.outcome import RUNNING, SUCCESS, UNSTABLE, Outcome
 from wbm.envs.pregrasp import StartBank
 from wbm.envs.randomization import Randomizer
 from wbm.envs.sensing import StateReader
+from wbm.envs.state import GraspState
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 from wbm.sim.config import SimConfig
 from wbm.sim.simulation import make_simulation
-
 
 _LIVE = ("episode", "scene", "scene_weight", "elapsed", "ctrl", "previous", "posture")
 
@@ -36,7 +36,7 @@ class GraspEnv:
 
     Attributes:
         obs: the teacher's observation [N,O] of the present state; its labels are `observe.labels`.
-        state: the present `GraspState`.
+        state: the present `GraspState`; known: what policy and gaze know of it, the same unless a subclass hides some.
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
         phase: 0 free space, 1 contact-rich [N].
@@ -184,7 +184,10 @@ class GraspEnv:
 
     def _start_joints(self, ids: Tensor, scenes: Tensor, u: Tensor) -> Tensor:
         """Joint positions [K,32] in which the episodes of environments `ids` start."""
-        return self.starts.draw(scenes, u[:, self._start].squeeze(1))
+        q = self.starts.draw(scenes, u[:, self._start].squeeze(1))
+        if self.cfg.action.neck == "fixed":
+            q[:, joints.NECK] = self._neck_home
+        return q
 
     def _contact_steps(self) -> Tensor:
         """Policy steps [N] since the contact-rich phase began."""
@@ -216,11 +219,21 @@ class GraspEnv:
     def step_targets(self, ctrl: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
         """One policy step with joint targets [N,32] in place of the controller's; returns what `step` does."""
         self.ctrl.copy_(ctrl)
+        self._fix_neck()
         return self._advance(torch.zeros_like(self.previous))
+
+    def _fix_neck(self) -> None:
+        """Without active vision the neck is told to stay at its home pose, whoever commands the other joints."""
+        if self.cfg.action.neck == "fixed":
+            self.ctrl[:, joints.NECK] = self._neck_home
+
+    def _known(self, s: GraspState) -> GraspState:
+        """What policy and gaze know of the state: all of it."""
+        return s
 
     def _command(self) -> None:
         """Fill `ctrl` from the action term, through the controller unless the term is in joint space."""
-        term, s = self.action, self.state
+        term = self.action
         self.ctrl[:, joints.HAND] = term.hand.target
         if self.cfg.action.term == "joint":
             self.ctrl[:, self._body] = term.target
@@ -231,11 +244,10 @@ class GraspEnv:
         self.ee_velocity.copy_(term.velocity)
         self.ee_target.copy_(term.pos)
         self.ee_target_quat.copy_(term.quat)
-        self.gaze.copy_(s.obj_pos_w)
+        self.gaze.copy_(self.known.obj_pos_w)
         self.controller.step()
         self.ctrl[:, self._body] = self.body_ctrl
-        if self.cfg.action.neck == "fixed":
-            self.ctrl[:, joints.NECK] = self.posture[:, -6:]
+        self._fix_neck()
 
     def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
         self.sim.ctrl.copy_(self.ctrl if self.noise is None else self.ctrl + self.noise)
@@ -269,7 +281,8 @@ class GraspEnv:
         """Recompute frames, state and observation from the simulation."""
         self.q_in.copy_(self.sim.qpos[:, : joints.NUM_JOINTS])
         self.controller.forward_kinematics()
-        self.state = s = self.reader.read(self.frame_pos, self.frame_quat)
+        self.state = self.reader.read(self.frame_pos, self.frame_quat)
+        self.known = s = self._known(self.state)
         time = self._contact_steps() / self.max_steps
         offset = self.action.offset(s.q, s.ee_pos_w, s.ee_quat)
         self.obs = self.observe(
@@ -299,6 +312,7 @@ class GraspEnv:
             name: wp.to_torch(getattr(c, name)) for name in ("qd", "q_target", "min_distance", "_fresh")
         }
         self._body = torch.as_tensor(joints.WBC, device=self.device)
+        self._neck_home = torch.tensor(self.robot.q_home[joints.NECK], dtype=torch.float32, device=self.device)
 
     def _obstacles(self, ids: Tensor, scenes: Tensor) -> None:
         t = self.binding.table

@@ -15,8 +15,12 @@ TERMS = ("reach", "contact", "grasp", "lift", "stable", "col", "act", "smooth")
 
 
 def reach(s: GraspState, c: RewardConfig) -> Tensor:
-    """exp(-mean tip gap / l) + exp(-centre gap / l) / 2: hand and fingertips come near the object."""
-    return torch.exp(-s.tip_gap.mean(-1) / c.reach_length) + 0.5 * torch.exp(-s.centre_gap / c.reach_length)
+    """exp(-mean tip gap / l) + exp(-centre gap / l) / 2: hand and fingertips come near the object.
+
+    Episodes that start far away may add `reach_far` exp(-centre gap / L), whose slope is felt there.
+    """
+    near = torch.exp(-s.tip_gap.mean(-1) / c.reach_length) + 0.5 * torch.exp(-s.centre_gap / c.reach_length)
+    return near if c.reach_far == 0 else near + c.reach_far * torch.exp(-s.centre_gap / c.reach_far_length)
 
 
 def contact(s: GraspState, c: RewardConfig) -> Tensor:

@@ -13,6 +13,7 @@ from wbm.envs.binding import SceneBinding
 from wbm.envs.config import EnvConfig
 from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.pregrasp import StartBank, solve_starts, target_of
+from wbm.envs.seen_env import SeenEnv
 from wbm.envs.whole_body import WholeBodyEnv
 from wbm.robot.config import MjcfOptions
 from wbm.robot.joints import NUM_JOINTS
@@ -76,8 +77,11 @@ def make_env(
     bank.approach[rows] = approach
     binding = SceneBinding(model, bank, rows[usable], device)
     kept = StartBank(starts.q[starts.usable], starts.count[starts.usable])
-    kind = WholeBodyEnv if cfg.env.start == "whole_body" else GraspEnv
-    return kind(binding, kept, model.robot, cfg.env, cfg.sim, cfg.wbc, num_envs, seed, device)
+    env = cfg.env
+    kind = WholeBodyEnv if env.start == "whole_body" else GraspEnv
+    if env.observe == "seen":
+        kind, env = SeenEnv, env if env.start == "whole_body" else replace(env, pregrasp_share=1.0)
+    return kind(binding, kept, model.robot, env, cfg.sim, cfg.wbc, num_envs, seed, device)
 
 
 def find_starts(

@@ -130,11 +130,13 @@ class EvaluationWorld:
     def row(self, record: Record) -> dict[str, Any]:
         """A record as the report reads it."""
         objects, scene = self.assets.objects, record.scene_index
+        name, family = str(objects.name[record.object_index]), str(objects.family[record.object_index])
         return {
             **record.to_dict(),
             "seed": record.episode,
-            "object": str(objects.family[record.object_index]),
-            "object_name": str(objects.name[record.object_index]),
+            # A folder of meshes without subfolders is no kind of object: there each is its own.
+            "object": name if family == "mesh" else family,
+            "object_name": name,
             "scene": KINDS[record.kind],
             "scene_row": int(self.env.binding.scenes[scene]),
             "instruction": str(self.assets.texts.sentence[self.sentence[scene]]),
