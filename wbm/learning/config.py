@@ -33,8 +33,8 @@ class TeacherConfig:
     split: str = "train"
     eval_split: str = "val"
     num_envs: int = 128
-    iterations: int = 400
-    eval_every: int = 20
+    iterations: int = 360
+    eval_every: int = 60
     eval_episodes: int = 128
     eval_envs: int = 64
     patience: int = 6
@@ -79,18 +79,18 @@ class PpoConfig:
     """
 
     steps: int = 32
-    epochs: int = 5
-    minibatches: int = 4
+    epochs: int = 4
+    minibatches: int = 8
     hidden: tuple[int, ...] = (256, 128, 64)
     activation: str = "elu"
     gamma: float = 0.98
     lam: float = 0.95
     clip: float = 0.2
-    lr: float = 1e-3
-    schedule: str = "adaptive"
+    lr: float = 4e-4
+    schedule: str = "linear"
     lr_final: float = 0.1
     desired_kl: float = 0.02
-    entropy: float = 0.002
+    entropy: float = 0.0005
     value_coef: float = 1.0
     max_grad_norm: float = 1.0
     init_std: float = 0.55
