@@ -49,6 +49,11 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     draft.metrics |= summary
 
 
+def uses_gpu(cfg: Any) -> bool:
+    """The physics engine decides."""
+    return cfg.sim.engine == "mujoco_warp"
+
+
 def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[dict[str, Any]]:
     """Play what is missing; a finished block is a file in the scratch folder, from which an interrupted run goes on."""
     from wbm.envs.world import WorldConfig
@@ -75,6 +80,7 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
             _write(_block(blocks, result.first), result.records)
             won = sum(r["success"] for r in result.records)
             task.update(len(result.records), success=won / len(result.records))
+            progress.safe_point()
     return [r for job in jobs for r in json.loads(_block(blocks, job.first).read_text())]
 
 

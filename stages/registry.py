@@ -9,15 +9,24 @@ A stage module is light to import (torch, warp and mujoco are imported inside `r
     def run(cfg, inputs, draft, progress) -> None
     EACH: tuple[str, str]        optional: ("teacher", "teachers") makes `wbm run` run the stage once for each ENTRY of
                                  `teachers`, with the override `teacher=ENTRY`
+
+and, for clusters, optionally
+
+    def uses_gpu(cfg) -> bool    whether a GPU helps under this configuration
+    RANKED = True                several processes can run it together (torch.distributed)
+    def parts(cfg) -> int        into how many parts the work falls; jobs on different nodes make them with
+    def make_parts(cfg, inputs, places, workers) -> Iterator[int]    which makes part k in the folder `places[k]` and
+                                 yields k; `run` finds it as the folder PARTS/k below `draft.path`
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+PARTS = "parts"
 MODULES: dict[str, str] = {
     "prepare-assets": "stages.prepare_assets",
     "train-teacher": "stages.train_teacher",
@@ -49,6 +58,10 @@ class Stage:
     artifact_name: Callable[[Any], str]
     run: Callable[..., None]
     each: tuple[str, str] | None
+    uses_gpu: Callable[[Any], bool]
+    ranked: bool
+    parts: Callable[[Any], int] | None
+    make_parts: Callable[..., Iterator[int]] | None
 
 
 def slot(text: str) -> Slot:
@@ -75,6 +88,10 @@ def load(name: str) -> Stage:
         artifact_name=module.name,
         run=module.run,
         each=getattr(module, "EACH", None),
+        uses_gpu=getattr(module, "uses_gpu", lambda _: False),
+        ranked=getattr(module, "RANKED", False),
+        parts=getattr(module, "parts", None),
+        make_parts=getattr(module, "make_parts", None),
     )
 
 
