@@ -156,11 +156,11 @@ def _submit(options: Options, composed: Sequence[Composed]) -> None:
     if made:
         submit.say_detached(*made)
         submit.wait(*made, config.launcher, progress)
-    done = submit.outcomes(runs, *(made or (None, None)), store)
+    done = submit.outcomes(runs, made, store)
     if options.as_json:
-        emit(_document([outcome for row in done for outcome in row]))
+        emit(_document(done))
     else:
-        sys.stdout.write(results_table([outcome for row in done for outcome in row]))
+        sys.stdout.write(results_table(done))
 
 
 def _sweep(options: Options, composed: Sequence[Composed]) -> None:

@@ -17,14 +17,18 @@ from stages.provenance import command_line, git_state
 from wbm.artifacts.digest import digest_value, plain
 from wbm.artifacts.store import Store
 from wbm.launch.config import LauncherConfig
+from wbm.launch.jobs import job_ids
 from wbm.launch.slurm import TaskState, require_slurm, states, submit
-from wbm.launch.submission import Resources, Submission, Task, create
+from wbm.launch.submission import Resources, Submission, Task, create, read_result
 
 ENTRY = "stages.job:main"
 SHARDS = "-shards"
 
 
-def submit_nodes(runs: Sequence[Sequence[Node]], cfg: LauncherConfig, store: Store, *, force: bool) -> Any:
+Made = tuple[Submission, Path]
+
+
+def submit_nodes(runs: Sequence[Sequence[Node]], cfg: LauncherConfig, store: Store, *, force: bool) -> Made | None:
     """Submit what is not up to date.
 
     Args:
@@ -146,8 +150,6 @@ def wait(submission: Submission, place: Path, cfg: LauncherConfig, progress: Pro
     Raises:
         StageError: a task failed or was lost.
     """
-    from wbm.launch.jobs import job_ids
-
     ids, seen = job_ids(place), {}
     with progress, progress.task("jobs", total=len(submission.tasks)) as bar:
         while True:
@@ -168,24 +170,19 @@ def wait(submission: Submission, place: Path, cfg: LauncherConfig, progress: Pro
     return found
 
 
-def outcomes(runs: Sequence[Sequence[Node]], submission: Submission | None, place: Path | None, store: Store) -> Any:
-    """What became of the nodes of each run, as a local run would say."""
-    from wbm.launch.submission import read_result
-
+def outcomes(runs: Sequence[Sequence[Node]], submitted: Made | None, store: Store) -> list[Outcome]:
+    """What became of the nodes, as a local run would say."""
     made = {}
-    for task in submission.tasks if submission and place else ():
-        result = read_result(place, task.name) if place else None
+    for task in submitted[0].tasks if submitted else ():
+        result = read_result(submitted[1], task.name) if submitted else None
         if result and "artifact" in result:
             made[digest_value([task.work["artifact"].split("/")[:2], task.work["config_digest"]])] = result
     out = []
-    for nodes in runs:
-        row = []
-        for node in nodes:
-            result = made.get(digest_value([node.ref.split("/"), digest_value(node.sections)]))
-            artifact = store.resolve(result["artifact"] if result else node.done.ref if node.done else node.ref)
-            state, seconds = ("ran", result["seconds"]) if result else ("up to date", 0.0)
-            row.append(Outcome(node, state, seconds, artifact.manifest, artifact.path))
-        out.append(row)
+    for node in (node for nodes in runs for node in nodes):
+        result = made.get(digest_value([node.ref.split("/"), digest_value(node.sections)]))
+        artifact = store.resolve(result["artifact"] if result else node.done.ref if node.done else node.ref)
+        state, seconds = ("ran", result["seconds"]) if result else ("up to date", 0.0)
+        out.append(Outcome(node, state, seconds, artifact.manifest, artifact.path))
     return out
 
 

@@ -60,6 +60,8 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
 
         def report(p: Progress) -> None:
             nonlocal shown
+            if shown == 0 and p.iteration > 1:
+                progress.message(f"  going on after iteration {p.iteration - 1}")
             task.update(p.iteration - shown, reward=p.reward, success=p.success, evaluation=p.evaluation)
             shown = p.iteration
             progress.safe_point()

@@ -86,6 +86,14 @@ class SlurmCluster:
             del self.env[name]
 
     def __enter__(self) -> SlurmCluster:
+        try:
+            self._start()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def _start(self) -> None:
         for name in ("munge", "controller", *NODES):
             (self.folder / name).mkdir(parents=True, exist_ok=True)
         for path in (self.folder, self.folder / "munge"):
@@ -102,10 +110,8 @@ class SlurmCluster:
         self.wait_for(
             lambda: {*NODES} == {*self.run("sinfo", "-h", "-N", "-t", "idle", "-o", "%N").split()}, "idle nodes"
         )
-        return self
 
     def __exit__(self, *_: object) -> None:
-        self.run("scancel", "--full", "-u", "root", check=False)
         for node in NODES:
             self.kill_node(node)
         self.kill_controller()
@@ -113,7 +119,7 @@ class SlurmCluster:
 
     def run(self, *command: str, check: bool = True) -> str:
         """Output of a command against this cluster."""
-        done = subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=60)
+        done = subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=300)
         if check and done.returncode:
             raise RuntimeError(f"{' '.join(command)}: {done.stderr}")
         return done.stdout
@@ -214,7 +220,7 @@ def _descendants(roots: list[int | None]) -> list[int]:
 
 def _free_ports(count: int) -> list[int]:
     """The first of consecutive ports that are free on 127.0.0.1."""
-    for first in range(26817, 60000, 50):
+    for first in range(20000 + os.getpid() % 400 * 100, 64000, 50):
         ports = list(range(first, first + count))
         sockets = [socket.socket() for _ in ports]
         try:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import subprocess
 import sys
+import time
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
@@ -47,7 +50,7 @@ class Job:
             return
         if rank == 0 and stop.requeue and not (self.place / "cancelled").exists():
             assert callable(requeue)
-            requeue(signal.SIGUSR2, None)
+            _insist(requeue)
         wait_to_be_ended()
 
     def checkpoint(self):
@@ -65,6 +68,16 @@ class Job:
                     return True
             write_result(self.place, self.task, {"state": "failed", "message": f"crashed {self.retries + 1} times"})
         return False
+
+
+def _insist(requeue: Callable[[int, None], object]) -> None:
+    """Queue the job again; a controller that is away comes back. Leaves by `SystemExit` when it is done."""
+    while True:
+        try:
+            requeue(signal.SIGUSR2, None)
+        except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+            print(f"requeue: {error}", file=sys.stderr, flush=True)
+            time.sleep(2.0)
 
 
 def crash_file(place: Path, job: str) -> Path:
