@@ -13,9 +13,9 @@ from stages.commands import open_store
 from stages.config import Config
 from stages.convert import convert
 from stages.pipeline import StageError, follow_node, run_node
-from stages.plan import Node, SectionView, compute_key
+from stages.plan import Node, bare_node, compute_key
 from stages.progress import Progress
-from wbm.artifacts.digest import KEY_LENGTH, plain
+from wbm.artifacts.digest import KEY_LENGTH
 from wbm.artifacts.lease import TERM_S
 from wbm.artifacts.manifest import Manifest
 from wbm.artifacts.shards import claim_shard
@@ -68,9 +68,7 @@ def thaw(work: dict[str, Any], config: Config, store: Store, place: Path) -> Nod
     if changed:
         more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
         raise StageError(f"{stage.name}: {changed[0]}{more} changed since this was submitted; submit again")
-    sections = {name: plain(getattr(config, name), key_only=True) for name in stage.sections}
-    name = stage.artifact_name(SectionView(config, stage))
-    node = Node(stage, config, tuple(work["overrides"]), stage.kind, name, code, sections)
+    node = bare_node(stage, config, tuple(work["overrides"]), code)
     node.fixed = {slot: _input(slot, entry, store, place) for slot, entry in work["inputs"].items()}
     node.inputs = dict(node.fixed)
     node.key = compute_key(node)

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from stages.plan import Node, because, look_up
+from stages.plan import Node, look_up
 from stages.progress import Progress
 from stages.provenance import command_line, environment, git_state
+from stages.reasons import because
 from wbm.artifacts.errors import ArtifactError
 from wbm.artifacts.lease import TERM_S
 from wbm.artifacts.manifest import Manifest

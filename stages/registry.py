@@ -7,6 +7,8 @@ A stage module is light to import (torch, warp and mujoco are imported inside `r
     INPUTS: tuple[str, ...]      input slots: "assets", "teacher/*" (the whole suite), "policy:student" (slot:kind)
     def name(cfg) -> str         name of the artifact under this configuration
     def run(cfg, inputs, draft, progress) -> None
+    def outside(cfg) -> dict[str, str]
+                                 optional: digests, by name, of what it reads outside the store; they join the key
     EACH: tuple[str, str]        optional: ("teacher", "teachers") makes `wbm run` run the stage once for each ENTRY of
                                  `teachers`, with the override `teacher=ENTRY`
 
@@ -58,10 +60,11 @@ class Stage:
     artifact_name: Callable[[Any], str]
     run: Callable[..., None]
     each: tuple[str, str] | None
-    uses_gpu: Callable[[Any], bool]
-    ranked: bool
-    parts: Callable[[Any], int] | None
-    make_parts: Callable[..., Iterator[int]] | None
+    uses_gpu: Callable[[Any], bool] = lambda cfg: False
+    ranked: bool = False
+    parts: Callable[[Any], int] | None = None
+    make_parts: Callable[..., Iterator[int]] | None = None
+    outside: Callable[[Any], dict[str, str]] = lambda cfg: {}
 
 
 def slot(text: str) -> Slot:
@@ -88,10 +91,11 @@ def load(name: str) -> Stage:
         artifact_name=module.name,
         run=module.run,
         each=getattr(module, "EACH", None),
-        uses_gpu=getattr(module, "uses_gpu", lambda _: False),
+        uses_gpu=getattr(module, "uses_gpu", Stage.uses_gpu),
         ranked=getattr(module, "RANKED", False),
         parts=getattr(module, "parts", None),
         make_parts=getattr(module, "make_parts", None),
+        outside=getattr(module, "outside", Stage.outside),
     )
 
 
