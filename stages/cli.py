@@ -26,6 +26,8 @@ bundle_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made, and try it out."
 )
 app.add_typer(bundle_app, name="bundle")
+jobs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="What was submitted to the cluster.")
+app.add_typer(jobs_app, name="jobs")
 
 STAGES = {
     "prepare-assets": "Stage 1: objects, convex parts, settled scenes.",
@@ -340,6 +342,33 @@ def bundle_compare(overrides: Overrides = None, debug: Debug = False, as_json: J
     _call("commands_bundle", "compare", overrides or [], as_json)
 
 
+Submission = Annotated[str, typer.Argument(metavar="SUBMISSION", help="Its id, or the beginning of it, or latest.")]
+
+
+@jobs_app.command("ls")
+def jobs_ls(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """List submissions and where their tasks are."""
+    _call("commands_jobs", "ls", overrides or [], as_json)
+
+
+@jobs_app.command("logs")
+def jobs_logs(
+    submission: Submission = "latest",
+    overrides: Overrides = None,
+    task: Annotated[str, typer.Option("--task", metavar="TASK", help="Only this one.")] = "",
+    lines: Annotated[int, typer.Option("-n", "--lines", help="Last lines of each log.")] = 20,
+    debug: Debug = False,
+) -> None:
+    """Show the logs of a submission."""
+    _call("commands_jobs", "logs", submission, overrides or [], task, lines)
+
+
+@jobs_app.command("cancel")
+def jobs_cancel(submission: Submission, overrides: Overrides = None, debug: Debug = False) -> None:
+    """Cancel all jobs of a submission."""
+    _call("commands_jobs", "cancel", submission, overrides or [])
+
+
 Remote = Annotated[str, typer.Argument(metavar="URL", help="s3://bucket/prefix or a directory.")]
 
 
@@ -386,7 +415,7 @@ def _exit_code(error: BaseException) -> int:
         return _complain("interrupted", 1)
     if kind == "ConfigError":
         return _complain(str(error), 2)
-    if kind in ("StageError", "FactsError", "Interrupted", "ArtifactError", "Missing", "Conflict"):
+    if kind in ("StageError", "FactsError", "Interrupted", "ArtifactError", "Missing", "Conflict", "LaunchError"):
         return _complain(str(error), 1)
     text = " ".join(str(error).split())
     hint = "" if isinstance(error, OSError) else "; add --debug for the traceback"

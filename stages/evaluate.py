@@ -52,6 +52,11 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     draft.metrics |= summary
 
 
+def uses_gpu(cfg: Any) -> bool:
+    """The physics engine decides."""
+    return cfg.sim.engine == "mujoco_warp"
+
+
 def _check_kind(policy: Any) -> None:
     from wbm.learning.evaluation import POLICY_KINDS
 
@@ -96,6 +101,7 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
             _write(_block(blocks, result.first), result.records)
             won = sum(r["success"] for r in result.records)
             task.update(len(result.records), success=won / len(result.records))
+            progress.safe_point()
     return [r for job in jobs for r in json.loads(_block(blocks, job.first).read_text())]
 
 
