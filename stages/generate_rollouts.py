@@ -25,6 +25,7 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
         draft: shards go to `draft.path/shards`, a report of each to `draft.path/reports`.
         progress: offers `task`.
     """
+    from wbm.artifacts.files import write_atomic
     from wbm.envs.world import WorldConfig
     from wbm.learning.rollouts import ShardJob, ShardReport, merge_reports
     from wbm.learning.workers import run_jobs
@@ -38,15 +39,15 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
         ShardJob(i, folder, assets, teachers, world, cfg.sensors, cfg.rollouts, cfg.seed)
         for i in range(cfg.rollouts.shards)
     ]
-    # A shard is done when its index and its report are there; anything less is made again.
+    # A shard is done when its report is on the disk, which is flushed after the shard; anything less is made again.
     waiting = [job for job in jobs if not (reports / f"{job.shard:05d}.json").exists()]
+    for job in waiting:
+        (folder / f"shard-{job.shard:05d}.json").unlink(missing_ok=True)  # finished, but its report was lost
     with progress.task("rollouts", total=len(jobs)) as task:
         task.update(len(jobs) - len(waiting))
         for report in run_jobs("wbm.learning.rollouts", waiting, cfg.rollouts.workers):
-            path = reports / f"{report.shard:05d}.json"
-            partial = path.with_suffix(".partial")
-            partial.write_text(json.dumps(report.to_dict(), sort_keys=True) + "\n", encoding="utf-8")
-            partial.replace(path)
+            text = json.dumps(report.to_dict(), sort_keys=True) + "\n"
+            write_atomic(reports / f"{report.shard:05d}.json", text.encode())
             task.update(1, kept=report.kept)
     done = [ShardReport(**json.loads((reports / f"{job.shard:05d}.json").read_text())) for job in jobs]
     totals = merge_reports(done)
