@@ -22,8 +22,12 @@ artifacts_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="L
 app.add_typer(artifacts_app, name="artifacts")
 robot_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The robot that everything is built on.")
 app.add_typer(robot_app, name="robot")
-bundle_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made.")
+bundle_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made, and try it out."
+)
 app.add_typer(bundle_app, name="bundle")
+jobs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="What was submitted to the cluster.")
+app.add_typer(jobs_app, name="jobs")
 
 STAGES = {
     "prepare-assets": "Stage 1: objects, convex parts, settled scenes.",
@@ -58,6 +62,9 @@ Source = Annotated[
 ]
 Until = Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Figure4 = Annotated[
+    bool, typer.Option("--figure4", help="The paper's three arms instead, every seed; continues where it stopped.")
+]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 
 
@@ -110,8 +117,36 @@ def _add_stage(name: str, text: str) -> None:
     app.command(name)(command)
 
 
+def _add_evaluate(text: str) -> None:
+    def command(
+        overrides: Overrides = None,
+        figure4: Figure4 = False,
+        cfg: Cfg = False,
+        info: Info = False,
+        multirun: Multi = False,
+        launcher: Launcher = "local",
+        detach: Detach = False,
+        force: Force = False,
+        debug: Debug = False,
+        as_json: Json = False,
+    ) -> None:
+        if figure4:
+            if cfg or info or multirun or detach or launcher != "local":
+                raise typer.BadParameter("--figure4 goes with --force, --debug and --json alone")
+            _call("commands_figure4", "figure4_command", overrides or [], force, as_json)
+            return
+        _run("evaluate", overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach,
+             force=force, as_json=as_json)  # fmt: skip
+
+    command.__doc__ = text
+    app.command("evaluate")(command)
+
+
 for _name, _text in STAGES.items():
-    _add_stage(_name, _text)
+    if _name == "evaluate":
+        _add_evaluate(_text)
+    else:
+        _add_stage(_name, _text)
 
 
 @app.command()
@@ -120,11 +155,15 @@ def plan(
     check: Annotated[bool, typer.Option("--check", help="Exit with 3 when a stage would run.")] = False,
     until: Until = None,
     source: Source = None,
+    figure4: Figure4 = False,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """Say which stages would run, and why."""
-    _call("commands", "plan_command", overrides or [], check, as_json, until, source)
+    if figure4:
+        _call("commands_figure4", "figure4_plan", overrides or [], check, as_json)
+    else:
+        _call("commands", "plan_command", overrides or [], check, as_json, until, source)
 
 
 @app.command("repro-diff")
@@ -241,27 +280,93 @@ FilePath = Annotated[str, typer.Argument(metavar="PATH", help="A file or folder.
 
 
 @robot_app.command("show")
-def robot_show(debug: Debug = False, as_json: Json = False) -> None:
+def robot_show(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """Joints, limits, masses and spheres."""
-    _call("commands_robot", "robot_show", as_json)
+    _call("commands_robot", "robot_show", overrides or [], as_json)
 
 
 @robot_app.command("export")
-def robot_export(path: FilePath, debug: Debug = False) -> None:
+def robot_export(path: FilePath, overrides: Overrides = None, debug: Debug = False) -> None:
     """Write a standalone MJCF that opens in MuJoCo's viewer."""
-    _call("commands_robot", "robot_export", path)
+    _call("commands_robot", "robot_export", path, overrides or [])
+
+
+@robot_app.command("facts")
+def robot_facts(debug: Debug = False) -> None:
+    """Print the facts that robot.facts=FILE is laid over."""
+    _call("commands_robot", "robot_facts")
+
+
+BundlePath = Annotated[str, typer.Argument(metavar="BUNDLE", help="A file, its folder, or bundle/NAME in the store.")]
+LogPath = Annotated[str, typer.Argument(metavar="LOG", help="A run's log, as RunLog wrote it (.mcap).")]
+Minutes = Annotated[float, typer.Option("--minutes", help="How long.")]
+RunLogPath = Annotated[str | None, typer.Option("--log", metavar="FILE", help="Also log as on a robot (MCAP).")]
 
 
 @bundle_app.command("show")
-def bundle_show(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+def bundle_show(path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """The contract and provenance of a bundle."""
-    _call("commands_robot", "bundle", path, False, as_json)
+    _call("commands_bundle", "show", path, overrides or [], as_json)
 
 
 @bundle_app.command("verify")
-def bundle_verify(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+def bundle_verify(path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """Check every part of a bundle, and its golden vectors."""
-    _call("commands_robot", "bundle", path, True, as_json)
+    _call("commands_bundle", "verify", path, overrides or [], as_json)
+
+
+@bundle_app.command("replay")
+def bundle_replay(
+    log: LogPath, path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False
+) -> None:
+    """Run a bundle on what another one saw, and compare the actions."""
+    _call("commands_bundle", "replay_log", log, path, overrides or [], as_json)
+
+
+@bundle_app.command("soak")
+def bundle_soak(
+    path: BundlePath,
+    overrides: Overrides = None,
+    minutes: Minutes = 10.0,
+    log: RunLogPath = None,
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """Closed loop in real time: deadlines, jitter, memory."""
+    _call("commands_bundle", "soak_bundle", path, overrides or [], minutes, log, as_json)
+
+
+@bundle_app.command("compare")
+def bundle_compare(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Evaluate a bundle and its student on the same seeds."""
+    _call("commands_bundle", "compare", overrides or [], as_json)
+
+
+Submission = Annotated[str, typer.Argument(metavar="SUBMISSION", help="Its id, or the beginning of it, or latest.")]
+
+
+@jobs_app.command("ls")
+def jobs_ls(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """List submissions and where their tasks are."""
+    _call("commands_jobs", "ls", overrides or [], as_json)
+
+
+@jobs_app.command("logs")
+def jobs_logs(
+    submission: Submission = "latest",
+    overrides: Overrides = None,
+    task: Annotated[str, typer.Option("--task", metavar="TASK", help="Only this one.")] = "",
+    lines: Annotated[int, typer.Option("-n", "--lines", help="Last lines of each log.")] = 20,
+    debug: Debug = False,
+) -> None:
+    """Show the logs of a submission."""
+    _call("commands_jobs", "logs", submission, overrides or [], task, lines)
+
+
+@jobs_app.command("cancel")
+def jobs_cancel(submission: Submission, overrides: Overrides = None, debug: Debug = False) -> None:
+    """Cancel all jobs of a submission."""
+    _call("commands_jobs", "cancel", submission, overrides or [])
 
 
 Remote = Annotated[str, typer.Argument(metavar="URL", help="s3://bucket/prefix or a directory.")]
@@ -310,7 +415,7 @@ def _exit_code(error: BaseException) -> int:
         return _complain("interrupted", 1)
     if kind == "ConfigError":
         return _complain(str(error), 2)
-    if kind in ("StageError", "Interrupted", "ArtifactError", "Missing", "Conflict"):
+    if kind in ("StageError", "FactsError", "Interrupted", "ArtifactError", "Missing", "Conflict", "LaunchError"):
         return _complain(str(error), 1)
     text = " ".join(str(error).split())
     hint = "" if isinstance(error, OSError) else "; add --debug for the traceback"

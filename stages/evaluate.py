@@ -30,13 +30,16 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     from wbm.report.page import write_page
     from wbm.report.stats import summarise
 
+    policy = inputs["policy"].manifest
+    _check_kind(policy)
     records = _play(cfg, inputs, draft, progress)
     _film(cfg, inputs, draft, progress, records)
     summary = summarise(records)
+    if policy.kind == "bundle":
+        summary["refusals"] = _refusals(records)
     plain = [{k: v for k, v in r.items() if k not in ("video", "filmstrip")} for r in records]
     _write(draft.path / "summary.json", summary)
     _write(draft.path / "records.json", plain)
-    policy = inputs["policy"].manifest
     result = {
         **summary,
         "records": records,
@@ -47,6 +50,25 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
         result["curves"] = _curves(json.loads(curve.read_text()), policy.kind)
     write_page(draft.path / "report.html", result, embed_mb=cfg.evaluation.embed_mb)
     draft.metrics |= summary
+
+
+def uses_gpu(cfg: Any) -> bool:
+    """The physics engine decides."""
+    return cfg.sim.engine == "mujoco_warp"
+
+
+def _check_kind(policy: Any) -> None:
+    from wbm.learning.evaluation import POLICY_KINDS
+
+    if policy.kind not in POLICY_KINDS:
+        raise ValueError(f"policy={policy.ref} holds no policy; name a {', '.join(POLICY_KINDS[:-1])} or bundle")
+
+
+def _refusals(records: list[dict[str, Any]]) -> dict[str, int]:
+    """What a bundle's runtime refused over all episodes, by name."""
+    from collections import Counter
+
+    return dict(sorted(sum((Counter(r["refusals"]) for r in records), Counter()).items()))
 
 
 def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[dict[str, Any]]:
@@ -60,13 +82,17 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
 
     e, policy = cfg.evaluation, inputs["policy"]
     world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
+    split = e.split
+    if split == "test" and _strange(inputs["assets"].manifest, policy.manifest, draft.store):
+        split = "all"
+        progress.message("nobody trained on these objects: evaluating on all of them")
     blocks = draft.scratch / "blocks"
     blocks.mkdir(parents=True, exist_ok=True)
     jobs = [
         BlockJob(
             first, min(BLOCK, e.episodes - first), blocks, inputs["assets"].path, policy.path,
             policy.manifest.kind, world,
-            cfg.sensors, e.split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
+            cfg.sensors, split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
             cfg.seed + e.seed,
         )
         for first in range(0, e.episodes, BLOCK)
@@ -81,7 +107,29 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
             write_atomic(_block(blocks, result.first), _json(result.records))
             won = sum(r["success"] for r in result.records)
             task.update(len(result.records), success=won / len(result.records))
+            progress.safe_point()
     return [r for job in jobs for r in json.loads(_block(blocks, job.first).read_text())]
+
+
+def _strange(assets: Any, policy: Any, store: Any) -> bool:
+    """Whether the assets hold imported objects and the policy was trained on other assets."""
+    from wbm.artifacts.errors import ArtifactError
+
+    if assets.config.get("objects", {}).get("source") not in ("meshes", "pybullet"):
+        return False
+    waiting, known = list(policy.inputs.values()), False
+    while waiting:
+        ref = waiting.pop()
+        if ref.ref.startswith("assets/"):
+            if ref.content_digest == assets.content_digest:
+                return False
+            known = True
+            continue
+        try:
+            waiting += store.manifest(ref.ref).inputs.values()
+        except ArtifactError:
+            return False  # what it was trained on is no longer known
+    return known
 
 
 def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: list[dict[str, Any]]) -> None:
@@ -91,7 +139,7 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
     import numpy as np
 
     from wbm.artifacts.episode_reader import EpisodeReader, shard_paths
-    from wbm.report.films import FilmStudio, Trajectory, choose_films
+    from wbm.report.films import FilmStudio, Trajectory, choose_films, choose_strips
     from wbm.report.tracks import scene_solids, write_episode_mcap
     from wbm.robot.schema import PolicySchema
     from wbm.scenes.assets import load_assets
@@ -99,7 +147,7 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
     e, blocks = cfg.evaluation, draft.scratch / "blocks"
     assets, period = load_assets(inputs["assets"].path), 1.0 / PolicySchema().rate_hz
     chosen = choose_films(records, e.videos)
-    strips = [i for i, r in enumerate(records) if r["success"]][: e.filmstrips]
+    strips = choose_strips(records, e.filmstrips)
     if chosen or strips:
         studio = FilmStudio(assets, (e.video_width, e.video_height))
         folder = draft.path / "videos"
