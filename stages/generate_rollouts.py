@@ -37,8 +37,10 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     reports.mkdir(parents=True, exist_ok=True)
     _take_parts(draft.path)
     jobs = [_job(cfg, inputs, i, folder) for i in range(cfg.rollouts.shards)]
-    # A shard is done when its index and its report are there; anything less is made again.
+    # A shard is done when its report is on the disk, which is flushed after the shard; anything less is made again.
     waiting = [job for job in jobs if not _report(reports, job.shard).exists()]
+    for job in waiting:
+        (folder / f"shard-{job.shard:05d}.json").unlink(missing_ok=True)  # finished, but its report was lost
     with progress.task("rollouts", total=len(jobs)) as task:
         task.update(len(jobs) - len(waiting))
         for report in run_jobs("wbm.learning.rollouts", waiting, cfg.rollouts.workers):
@@ -87,11 +89,9 @@ def _report(reports: Path, shard: int) -> Path:
 
 
 def _write_report(reports: Path, report: Any) -> None:
-    reports.mkdir(exist_ok=True)
-    path = _report(reports, report.shard)
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(report.to_dict(), sort_keys=True) + "\n", encoding="utf-8")
-    partial.replace(path)
+    from wbm.artifacts.files import write_atomic
+
+    write_atomic(_report(reports, report.shard), (json.dumps(report.to_dict(), sort_keys=True) + "\n").encode())
 
 
 def _take_parts(path: Path) -> None:
