@@ -22,7 +22,9 @@ artifacts_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="L
 app.add_typer(artifacts_app, name="artifacts")
 robot_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The robot that everything is built on.")
 app.add_typer(robot_app, name="robot")
-bundle_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made.")
+bundle_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made, and try it out."
+)
 app.add_typer(bundle_app, name="bundle")
 
 STAGES = {
@@ -43,7 +45,7 @@ Items = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="[ARTIFACT]... [artifacts.root=DIR]",
-        help="kind/name[/key] or reference/name.",
+        help="kind/name[/key] or reference[/name].",
         show_default=False,
     ),
 ]
@@ -53,6 +55,9 @@ Multi = Annotated[bool, typer.Option("-m", "--multirun", help="Sweep: a,b and ra
 Launcher = Annotated[str, typer.Option("--launcher", help="Where to run: local or slurm.")]
 Detach = Annotated[bool, typer.Option("--detach", help="Submit and return at once.")]
 Force = Annotated[bool, typer.Option("--force", help="Run even if up to date, from the beginning.")]
+Source = Annotated[
+    str | None, typer.Option("--from", metavar="reference", help="Let reference results stand in for long stages.")
+]
 Until = Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 Figure4 = Annotated[
@@ -81,12 +86,13 @@ def run(
     detach: Detach = False,
     force: Force = False,
     until: Until = None,
+    source: Source = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """Run all six stages, skipping what is up to date."""
     _run(None, overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach, force=force,
-         until=until, as_json=as_json)  # fmt: skip
+         until=until, source=source, as_json=as_json)  # fmt: skip
 
 
 def _add_stage(name: str, text: str) -> None:
@@ -98,11 +104,12 @@ def _add_stage(name: str, text: str) -> None:
         launcher: Launcher = "local",
         detach: Detach = False,
         force: Force = False,
+        source: Source = None,
         debug: Debug = False,
         as_json: Json = False,
     ) -> None:
         _run(name, overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach, force=force,
-             as_json=as_json)  # fmt: skip
+             source=source, as_json=as_json)  # fmt: skip
 
     command.__doc__ = text
     app.command(name)(command)
@@ -145,6 +152,7 @@ def plan(
     overrides: Overrides = None,
     check: Annotated[bool, typer.Option("--check", help="Exit with 3 when a stage would run.")] = False,
     until: Until = None,
+    source: Source = None,
     figure4: Figure4 = False,
     debug: Debug = False,
     as_json: Json = False,
@@ -153,7 +161,7 @@ def plan(
     if figure4:
         _call("commands_figure4", "figure4_plan", overrides or [], check, as_json)
     else:
-        _call("commands", "plan_command", overrides or [], check, as_json, until)
+        _call("commands", "plan_command", overrides or [], check, as_json, until, source)
 
 
 @app.command("repro-diff")
@@ -253,31 +261,83 @@ def rm(items: Items = None, force: Force = False, debug: Debug = False, as_json:
     _call("commands_artifacts", "rm", items or [], force, as_json)
 
 
+@artifacts_app.command()
+def publish(
+    items: Items = None,
+    name: Annotated[str | None, typer.Option("--as", metavar="NAME", help="Default: the kind, or kind_name.")] = None,
+    without: Annotated[list[str] | None, typer.Option("--without", metavar="PATTERN", help="Leave files out.")] = None,
+    limit: Annotated[float, typer.Option("--limit-mb", help="Largest size of all reference results, MB.")] = 20.0,
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """Copy one to the reference results, to be committed."""
+    _call("commands_artifacts", "publish", items or [], name, without or [], limit, as_json)
+
+
 FilePath = Annotated[str, typer.Argument(metavar="PATH", help="A file or folder.")]
 
 
 @robot_app.command("show")
-def robot_show(debug: Debug = False, as_json: Json = False) -> None:
+def robot_show(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """Joints, limits, masses and spheres."""
-    _call("commands_robot", "robot_show", as_json)
+    _call("commands_robot", "robot_show", overrides or [], as_json)
 
 
 @robot_app.command("export")
-def robot_export(path: FilePath, debug: Debug = False) -> None:
+def robot_export(path: FilePath, overrides: Overrides = None, debug: Debug = False) -> None:
     """Write a standalone MJCF that opens in MuJoCo's viewer."""
-    _call("commands_robot", "robot_export", path)
+    _call("commands_robot", "robot_export", path, overrides or [])
+
+
+@robot_app.command("facts")
+def robot_facts(debug: Debug = False) -> None:
+    """Print the facts that robot.facts=FILE is laid over."""
+    _call("commands_robot", "robot_facts")
+
+
+BundlePath = Annotated[str, typer.Argument(metavar="BUNDLE", help="A file, its folder, or bundle/NAME in the store.")]
+LogPath = Annotated[str, typer.Argument(metavar="LOG", help="A run's log, as RunLog wrote it (.mcap).")]
+Minutes = Annotated[float, typer.Option("--minutes", help="How long.")]
+RunLogPath = Annotated[str | None, typer.Option("--log", metavar="FILE", help="Also log as on a robot (MCAP).")]
 
 
 @bundle_app.command("show")
-def bundle_show(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+def bundle_show(path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """The contract and provenance of a bundle."""
-    _call("commands_robot", "bundle", path, False, as_json)
+    _call("commands_bundle", "show", path, overrides or [], as_json)
 
 
 @bundle_app.command("verify")
-def bundle_verify(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+def bundle_verify(path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """Check every part of a bundle, and its golden vectors."""
-    _call("commands_robot", "bundle", path, True, as_json)
+    _call("commands_bundle", "verify", path, overrides or [], as_json)
+
+
+@bundle_app.command("replay")
+def bundle_replay(
+    log: LogPath, path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False
+) -> None:
+    """Run a bundle on what another one saw, and compare the actions."""
+    _call("commands_bundle", "replay_log", log, path, overrides or [], as_json)
+
+
+@bundle_app.command("soak")
+def bundle_soak(
+    path: BundlePath,
+    overrides: Overrides = None,
+    minutes: Minutes = 10.0,
+    log: RunLogPath = None,
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """Closed loop in real time: deadlines, jitter, memory."""
+    _call("commands_bundle", "soak_bundle", path, overrides or [], minutes, log, as_json)
+
+
+@bundle_app.command("compare")
+def bundle_compare(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Evaluate a bundle and its student on the same seeds."""
+    _call("commands_bundle", "compare", overrides or [], as_json)
 
 
 Remote = Annotated[str, typer.Argument(metavar="URL", help="s3://bucket/prefix or a directory.")]
@@ -326,7 +386,7 @@ def _exit_code(error: BaseException) -> int:
         return _complain("interrupted", 1)
     if kind == "ConfigError":
         return _complain(str(error), 2)
-    if kind in ("StageError", "Interrupted", "ArtifactError", "Missing", "Conflict"):
+    if kind in ("StageError", "FactsError", "Interrupted", "ArtifactError", "Missing", "Conflict"):
         return _complain(str(error), 1)
     text = " ".join(str(error).split())
     hint = "" if isinstance(error, OSError) else "; add --debug for the traceback"

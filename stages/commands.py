@@ -18,9 +18,11 @@ from stages.config import Config
 from stages.convert import ConfigError
 from stages.pipeline import Outcome, StageError, run_node, run_nodes
 from stages.progress import Progress
+from stages.reasons import because
 from stages.tables import results_table, sweep_table
 from wbm.artifacts.digest import plain
 from wbm.artifacts.errors import ArtifactError
+from wbm.artifacts.reference import WORD
 from wbm.artifacts.store import Store
 
 LAUNCHERS = ("local", "slurm")
@@ -40,6 +42,7 @@ class Options:
     force: bool = False
     as_json: bool = False
     until: str | None = None
+    source: str | None = None  # `reference`: its results stand in for the long stages
 
 
 def composer(overrides: Sequence[str]) -> Config:
@@ -48,9 +51,16 @@ def composer(overrides: Sequence[str]) -> Config:
 
 
 def open_store(config: Config) -> Store:
-    """The store of a configuration, with the committed reference results of the checkout."""
-    reference = Path(__file__).resolve().parent.parent / "artifacts" / "reference"
-    return Store.open(config.artifacts.root, reference if reference.is_dir() else None)
+    """The store of a configuration, with the reference results."""
+    return Store.open(config.artifacts.root, reference_dir(config))
+
+
+def reference_dir(config: Config) -> Path:
+    """Folder of the reference results: what the settings name, else beside `stages/` or, in a wheel, inside it."""
+    if config.artifacts.reference:
+        return Path(config.artifacts.reference).expanduser().absolute()
+    here = Path(__file__).resolve().parent
+    return here / "reference" if (here / "reference").is_dir() else here.parent / "artifacts" / "reference"
 
 
 def emit(document: Any) -> None:
@@ -70,6 +80,7 @@ def run_command(options: Options) -> None:
     if options.detach and options.launcher == "local":
         raise ConfigError("--detach needs --launcher slurm")
     _known_stage(options.until)
+    _known_source(options.source)
     if options.info:
         sys.stdout.write(defaults_list(options.overrides) + "\n")
         return
@@ -96,6 +107,11 @@ def _known_stage(name: str | None) -> None:
         raise ConfigError(f"--until {name}: no such stage; there are {', '.join(registry.MODULES)}")
 
 
+def _known_source(name: str | None) -> None:
+    if name not in (None, WORD):
+        raise ConfigError(f"--from {name}: only '{WORD}' is known; name other artifacts with +inputs.SLOT=KIND/NAME")
+
+
 def _print_config(options: Options, composed: Sequence[Composed]) -> None:
     values = [plain(item.config) for item in composed]
     if options.stage is not None:
@@ -113,10 +129,12 @@ def run_once(options: Options, overrides: Sequence[str]) -> list[Outcome]:
     progress = Progress()
     if options.stage is None:
         stages = registry.load_until(options.until) if options.until else registry.load_all()
-        nodes = planning.build(stages, overrides, composer, store)
+        nodes = planning.build(stages, overrides, composer, store, reference=options.source == WORD)
+        _announce(nodes, store, progress)
         return run_nodes(nodes, store, progress, force=options.force)
     stages = registry.load_until(options.stage)
-    nodes = planning.single(stages[-1], stages, overrides, composer, store)
+    nodes = planning.single(stages[-1], stages, overrides, composer, store, reference=options.source == WORD)
+    _announce(nodes[-1:], store, progress)
     for node in nodes:
         planning.look_up(node, store, use_latest=node is nodes[-1])
     for upstream in nodes[:-1]:
@@ -125,9 +143,17 @@ def run_once(options: Options, overrides: Sequence[str]) -> list[Outcome]:
             planning.look_up(nodes[-1], store, use_latest=True)
     for upstream in nodes[:-1]:
         if upstream.stale and store.latest(upstream.kind, upstream.name):
-            reasons = planning.because(upstream.reasons)
+            reasons = because(upstream.reasons)
             progress.message(f"note: input {upstream.ref} is not up to date ({reasons}); using the newest")
     return [run_node(nodes[-1], store, progress, force=options.force)]
+
+
+def _announce(nodes: Sequence[planning.Node], store: Store, progress: Progress) -> None:
+    """Say which inputs are reference results."""
+    used = {m.ref for node in nodes for m in node.fixed.values()}
+    for text in store.references.names():
+        if (ref := store.references.get(text).ref) in used:
+            progress.message(f"{text} is used as {ref}")
 
 
 def _other_world(assets: planning.Node, store: Store) -> bool:
@@ -175,17 +201,21 @@ def _document(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def plan_command(overrides: Sequence[str], check: bool, as_json: bool, until: str | None = None) -> None:
+def plan_command(
+    overrides: Sequence[str], check: bool, as_json: bool, until: str | None = None, source: str | None = None
+) -> None:
     """Print which stages would run and why; with `check`, exit with 3 when there are any."""
     _known_stage(until)
+    _known_source(source)
     store = open_store(composer(overrides))
     stages = registry.load_until(until) if until else registry.load_all()
-    nodes = planning.plan(planning.build(stages, overrides, composer, store), store)
+    nodes = planning.build(stages, overrides, composer, store, reference=source == WORD)
+    planning.plan(nodes, store)
     if as_json:
         emit({"stale": any(node.stale for node in nodes), "stages": [_plan_entry(node) for node in nodes]})
     else:
         for node in nodes:
-            state = f"would run {planning.because(node.reasons)}" if node.stale else "up to date"
+            state = f"would run {because(node.reasons)}" if node.stale else "up to date"
             sys.stdout.write(f"{node.stage.name:18} {node.ref:24} {state}\n")
     if check and any(node.stale for node in nodes):
         raise Exit(3)

@@ -1,50 +1,45 @@
-"""`wbm robot` and `wbm bundle`: look at what the pipeline starts from, and at what it ends with."""
+"""`wbm robot`: look at what the pipeline starts from."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from stages.commands import emit
+from stages.commands import composer, emit
 
 
-def robot_show(as_json: bool) -> None:
-    """Print joints, limits, masses and spheres."""
+def robot_show(overrides: Sequence[str], as_json: bool) -> None:
+    """Print joints, limits, masses and spheres.
+
+    Raises:
+        FactsError: `robot.facts` makes no robot.
+    """
     from wbm.robot.export import describe_robot, format_robot
+    from wbm.robot.model import load_robot
 
+    robot = load_robot(composer(overrides).robot.facts)
     if as_json:
-        emit(describe_robot())
+        emit(describe_robot(robot))
     else:
-        sys.stdout.write(format_robot() + "\n")
+        sys.stdout.write(format_robot(robot) + "\n")
 
 
-def robot_export(path: str) -> None:
+def robot_export(path: str, overrides: Sequence[str]) -> None:
     """Write a standalone MJCF.
 
     Raises:
         OSError: the file cannot be written.
+        FactsError: `robot.facts` makes no robot.
     """
     from wbm.robot.export import export_robot
 
-    export_robot(Path(path))
+    export_robot(Path(path), composer(overrides).robot)
     sys.stderr.write(f"{path}: written; open it with `python -m mujoco.viewer --mjcf={path}`\n")
 
 
-def bundle(path: str, verify: bool, as_json: bool) -> None:
-    """Show or verify a bundle: a file, or the folder of a `bundle` artifact.
+def robot_facts() -> None:
+    """Print the standard facts: what `robot.facts` is laid over."""
+    from wbm.robot.facts import standard_text
 
-    Raises:
-        FileNotFoundError: there is no bundle.
-        BundleError: it is damaged; the message names the part.
-    """
-    from wbm.deploy.bundle import Bundle
-
-    place = Path(path)
-    opened = Bundle.open(place / "policy.wbm" if place.is_dir() else place)
-    answer = opened.verify() if verify else opened.show()
-    if as_json:
-        emit(answer)
-        return
-    for key, value in answer.items():
-        text = str(value)
-        sys.stdout.write(f"{key:<16} {text if len(text) <= 160 else text[:157] + '...'}\n")
+    sys.stdout.write(standard_text())

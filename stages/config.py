@@ -30,8 +30,8 @@ class Config:
     Attributes:
         seed: the seed from which all others derive.
         note: free text for the manifest; never part of a key.
-        policy: what to evaluate or export, as `kind/name[/key]` or `reference/name`; default: the student.
-        inputs: input slot -> artifact to use in place of the newest one.
+        policy: what to evaluate or export, as `kind/name[/key]` or `reference[/name]`; default: the student.
+        inputs: input slot -> artifact to use in place of the newest one; `teacher_NAME` is one teacher of the suite.
         teachers: the suite: names of presets in `conf/teacher/`.
 
     The other attributes are the sections; their dataclasses document them.

@@ -25,12 +25,11 @@ def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
     from wbm.deploy.runtime import PolicyRuntime
     from wbm.learning.export import export_onnx
     from wbm.learning.student import load_student
-    from wbm.robot.model import load_robot
     from wbm.scenes.assets import load_assets
 
     # Open the inputs
     policy = load_student(inputs["student"].path)
-    texts = load_assets(inputs["assets"].path).texts
+    assets = load_assets(inputs["assets"].path)
     schema = policy.schema
 
     # Export
@@ -43,12 +42,12 @@ def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
         answers = policy.act(golden).cpu().numpy()
 
         # Publish
-        sentences = dict(zip(map(str, texts.sentence), texts.embedding, strict=True))
+        sentences = dict(zip(map(str, assets.texts.sentence), assets.texts.embedding, strict=True))
         path = write_bundle(
             draft.path / "policy.wbm",
             onnx=onnx,
             contract=make_contract(
-                load_robot(), schema, cfg.deploy, inputs["student"].manifest.name, normalisers(policy)
+                assets.robot, schema, cfg.deploy, inputs["student"].manifest.name, normalisers(policy)
             ),
             golden_inputs=golden,
             golden_action=answers,
@@ -61,7 +60,8 @@ def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
         # Check the finished file, as a robot would
         bundle = Bundle.open(path)
         facts = bundle.verify()
-        replayed = rollout_parity(policy, bundle.policy(), inputs["evaluation"].path)
+        gaps = rollout_parity(policy, bundle.policy(), inputs["evaluation"].path)
+        replayed = None if gaps is None else float(gaps.max())
         if replayed is not None and replayed > cfg.deploy.parity_tolerance:
             raise ValueError(
                 f"on a replayed episode the bundle differs from torch by {replayed:.2g}, "

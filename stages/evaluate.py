@@ -30,13 +30,16 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     from wbm.report.page import write_page
     from wbm.report.stats import summarise
 
+    policy = inputs["policy"].manifest
+    _check_kind(policy)
     records = _play(cfg, inputs, draft, progress)
     _film(cfg, inputs, draft, progress, records)
     summary = summarise(records)
+    if policy.kind == "bundle":
+        summary["refusals"] = _refusals(records)
     plain = [{k: v for k, v in r.items() if k not in ("video", "filmstrip")} for r in records]
     _write(draft.path / "summary.json", summary)
     _write(draft.path / "records.json", plain)
-    policy = inputs["policy"].manifest
     result = {
         **summary,
         "records": records,
@@ -47,6 +50,20 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
         result["curves"] = _curves(json.loads(curve.read_text()), policy.kind)
     write_page(draft.path / "report.html", result, embed_mb=cfg.evaluation.embed_mb)
     draft.metrics |= summary
+
+
+def _check_kind(policy: Any) -> None:
+    from wbm.learning.evaluation import POLICY_KINDS
+
+    if policy.kind not in POLICY_KINDS:
+        raise ValueError(f"policy={policy.ref} holds no policy; name a {', '.join(POLICY_KINDS[:-1])} or bundle")
+
+
+def _refusals(records: list[dict[str, Any]]) -> dict[str, int]:
+    """What a bundle's runtime refused over all episodes, by name."""
+    from collections import Counter
+
+    return dict(sorted(sum((Counter(r["refusals"]) for r in records), Counter()).items()))
 
 
 def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[dict[str, Any]]:

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from stages.plan import Node, because, look_up
+from stages.plan import Node, look_up
 from stages.progress import Progress
 from stages.provenance import command_line, environment, git_state
+from stages.reasons import because
 from wbm.artifacts.errors import ArtifactError
 from wbm.artifacts.manifest import Manifest
 from wbm.artifacts.store import Artifact, Draft, Store

@@ -14,6 +14,26 @@ def name(cfg: Any) -> str:
     return cfg.objects.source
 
 
+def outside(cfg: Any) -> dict[str, str]:
+    """Digests of the robot's facts and of the meshes, where the user brings them.
+
+    Raises:
+        OSError: a file or folder cannot be read.
+        ValueError: the folder holds no meshes.
+    """
+    found = {}
+    if cfg.robot.facts:
+        from wbm.artifacts.digest import digest_bytes
+        from wbm.robot.facts import read_facts
+
+        found["robot.facts"] = digest_bytes(read_facts(cfg.robot.facts))
+    if cfg.objects.source != "procedural":
+        from wbm.scenes.sources import sources_digest
+
+        found["objects"] = sources_digest(cfg.objects)
+    return found
+
+
 def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     """Write `objects.npz`, `scenes.npz`, `instructions.npz`, `report.json`, the robot's MJCF and two contact sheets.
 
@@ -38,10 +58,11 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     bank, sentences = write_instructions(objects, bank, cfg.seed)
     texts = Texts(sentences, SentenceEncoder(cfg.scenes.encoder)(sentences.tolist()))
 
-    Assets(objects, bank, texts).save(draft.path, report)
+    assets = Assets(objects, bank, texts, model.robot)
+    assets.save(draft.path, report)
     export_robot(draft.path / "robot.xml", cfg.robot)
     object_sheet(objects, draft.path / "objects.png")
-    scene_sheet(objects, bank, draft.path / "scenes.png")
+    scene_sheet(assets, draft.path / "scenes.png")
     draft.metrics |= {
         "objects": len(objects),
         "objects_skipped": len(report["skipped"]),

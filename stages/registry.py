@@ -7,6 +7,8 @@ A stage module is light to import (torch, warp and mujoco are imported inside `r
     INPUTS: tuple[str, ...]      input slots: "assets", "teacher/*" (the whole suite), "policy:student" (slot:kind)
     def name(cfg) -> str         name of the artifact under this configuration
     def run(cfg, inputs, draft, progress) -> None
+    def outside(cfg) -> dict[str, str]
+                                 optional: digests, by name, of what it reads outside the store; they join the key
     EACH: tuple[str, str]        optional: ("teacher", "teachers") makes `wbm run` run the stage once for each ENTRY of
                                  `teachers`, with the override `teacher=ENTRY`
 """
@@ -51,6 +53,7 @@ class Stage:
     artifact_name: Callable[[Any], str]
     run: Callable[..., None]
     each: tuple[str, str] | None
+    outside: Callable[[Any], dict[str, str]] = lambda cfg: {}
 
 
 def slot(text: str) -> Slot:
@@ -78,6 +81,7 @@ def load(name: str) -> Stage:
         artifact_name=module.name,
         run=module.run,
         each=getattr(module, "EACH", None),
+        outside=getattr(module, "outside", Stage.outside),
     )
 
 

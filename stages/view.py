@@ -8,11 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from wbm.artifacts.errors import Missing
+
 if TYPE_CHECKING:
+    from wbm.artifacts.manifest import Artifact, Manifest
+    from wbm.artifacts.store import Store
     from wbm.report.viewer import Shown
 
 ROBOT = "robot"
 _EPISODE_FOLDERS = ("shards", "episodes")
+_VIEWABLE = ("evaluation", "rollouts", "assets")  # what `wbm view reference` looks for, in this order
 _MAX_SHOWN = 200
 
 
@@ -30,10 +35,8 @@ def view(items: Sequence[str], port: int = 8080) -> None:
     if names[0] == ROBOT:
         shown = robot_items()
     else:
-        artifact = store.resolve(names[0])
-        world = next(
-            (store.resolve(r.ref) for r in artifact.manifest.inputs.values() if r.ref.startswith("assets/")), None
-        )
+        artifact = store.resolve(names[0], _VIEWABLE)
+        world = _assets_of(artifact.manifest, store)
         shown = items_of(artifact.path, artifact.manifest.kind, world.path if world else None)
     viewer = Viewer(shown, port)
     sys.stderr.write(f"{viewer.address} shows {names[0]} ({len(shown)} to choose from); Ctrl+C ends\n")
@@ -44,6 +47,16 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         return
     finally:
         viewer.close()
+
+
+def _assets_of(manifest: Manifest, store: Store) -> Artifact | None:
+    """The assets that an artifact was made with; None when they are gone."""
+    for ref in (r.ref for r in manifest.inputs.values() if r.ref.startswith("assets/")):
+        try:
+            return store.resolve(ref)
+        except Missing:
+            sys.stderr.write(f"{ref} is not here any more: supports and other objects are not drawn\n")
+    return None
 
 
 def robot_items() -> list[Shown]:

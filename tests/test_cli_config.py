@@ -279,3 +279,8 @@ def test_worker_counts_and_notes_are_no_part_of_a_key():
     few, many = (compose.compose([f"rollouts.workers={n}"]).config.rollouts for n in (1, 4))
     assert few != many
     assert plain(few, key_only=True) == plain(many, key_only=True)
+
+
+def test_an_entry_of_a_mapping_needs_no_plus_sign():
+    for line in ("inputs.assets=assets/mine", "+inputs.assets=assets/mine"):
+        assert compose.compose([line]).config.inputs == {"assets": "assets/mine"}

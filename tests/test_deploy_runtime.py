@@ -80,7 +80,7 @@ def test_action_holds_the_action_before(bundle):
         np.testing.assert_array_equal(runtime.observation["prev_action"], previous)
         expected = forward({k: v[None] for k, v in runtime.observation.items()}, weights())[0]
         np.testing.assert_allclose(command.action, expected, atol=1e-5)
-        previous = to_increment(driver.q, command.q_target, SCHEMA.action).astype(np.float32)
+        previous = to_increment(np, driver.q, command.q_target, SCHEMA.action).astype(np.float32)
         driver.command(command)
 
 
@@ -238,15 +238,25 @@ def test_injected_faults_are_refused_by_name(bundle):
 
 def test_damaged_bundles_are_refused_by_name(bundle, tmp_path):
     raw, rng, path = bundle.path.read_bytes(), np.random.default_rng(5), tmp_path / "x.wbm"
+    damaged = {Fault.CHECKSUM, Fault.TRUNCATED, Fault.BUNDLE_VERSION, Fault.NOT_A_BUNDLE}
+    counts: Counter[Fault] = Counter()
     for i in range(FAULTS // 10):
-        data = bytearray(raw)
-        if i % 2:
+        data, names = bytearray(raw), damaged
+        if i % 3 == 0:
             data[rng.integers(len(data))] ^= 1 << rng.integers(8)
-        else:
+        elif i % 3 == 1:
             del data[rng.integers(len(data)) :]
+            names = {Fault.TRUNCATED, Fault.NOT_A_BUNDLE}
+        else:
+            version = b"wbm-bundle/%d" % rng.choice([0, *range(2, 10)])
+            data = data.replace(b"wbm-bundle/1", version)
+            names = {Fault.BUNDLE_VERSION}
         path.write_bytes(data)
-        with pytest.raises(BundleError):
+        with pytest.raises(BundleError) as caught:
             Bundle.open(path)
+        assert caught.value.fault in names
+        counts[caught.value.fault] += 1
+    assert counts.total() == FAULTS // 10 and counts[Fault.BUNDLE_VERSION] >= FAULTS // 30
 
 
 def test_network_without_an_answer_is_refused(tmp_path, bundle, monkeypatch):

@@ -1,7 +1,8 @@
 """The MJCF that the robot becomes: order, frames, servos, collisions, contact sensors, export."""
 
 import json
-import os
+import sys
+import types
 
 import mujoco
 import numpy as np
@@ -164,44 +165,83 @@ def test_menagerie_without_meshes_says_how_to_get_them(monkeypatch, tmp_path):
     with pytest.raises(FileNotFoundError, match="MENAGERIE_ROOT"):
         export.export_robot(tmp_path / "robot.xml", MjcfOptions(skin="menagerie"))
     monkeypatch.delenv("MENAGERIE_ROOT")
-    monkeypatch.setitem(__import__("sys").modules, "mujoco_menagerie", None)
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
     with pytest.raises(FileNotFoundError, match="pip install mujoco-menagerie"):
         export.export_robot(tmp_path / "robot.xml", MjcfOptions(skin="menagerie"))
 
 
-def test_menagerie_skin_is_visual_only(monkeypatch, tmp_path):
-    bodies = {"arm": "link3", "hand": "if_px", "neck": "link5", "base": "base_link"}
+TETRAHEDRON = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def stand_in_menagerie(root):
+    """The published collection's layout and habits, with a tetrahedron for every mesh.
+
+    Meshes are named by their files, some in subfolders; some descriptions draw a colliding mesh (the LEAP's fingertips)
+    or hold a transparent one (the PiPER's gripper); colours come from materials in default classes.
+    """
+    bodies = {"arm": "link3", "hand": "if_px", "neck": "link6", "base": "base_link"}
     for prefix, folder, _, file in skin.PARTS:
-        root = tmp_path / folder
-        (root / "assets").mkdir(parents=True)
-        (root / "assets" / "part.obj").write_text(
-            "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+        (root / folder / "assets" / "sub").mkdir(parents=True)
+        for name in ("sub/shell", "tip", "solid", "gripper"):
+            (root / folder / "assets" / f"{name}.obj").write_text(TETRAHEDRON)
+        (root / folder / file).write_text(
+            '<mujoco><compiler meshdir="./assets/"/><default>'
+            '<default class="visual">'
+            '<geom type="mesh" contype="0" conaffinity="0" group="2" material="paint"/></default>'
+            '<default class="tip"><geom type="mesh" mesh="soft" material="paint"/></default></default>'
+            '<asset><mesh file="sub/shell.obj"/><mesh name="soft" file="tip.obj"/><mesh file="solid.obj"/>'
+            '<mesh file="gripper.obj"/><material name="paint" rgba="1 0 0 1"/></asset><worldbody>'
+            f'<body name="{bodies[prefix]}"><geom class="visual" mesh="shell"/><geom class="tip"/>'
+            '<geom type="mesh" mesh="solid" group="3"/><geom type="mesh" mesh="gripper" rgba="1 1 1 0"/>'
+            '<body name="unknown"><geom class="visual" mesh="shell"/></body></body></worldbody></mujoco>'
         )
-        (root / file).write_text(
-            '<mujoco><compiler meshdir="assets"/><asset><mesh name="part" file="part.obj"/>'
-            '<material name="paint" rgba="1 0 0 1"/></asset><worldbody>'
-            f'<body name="{bodies[prefix]}">'
-            '<geom type="mesh" mesh="part" material="paint" contype="0" conaffinity="0"/>'
-            '<geom type="mesh" mesh="part"/></body></worldbody></mujoco>'
-        )
+
+
+def test_menagerie_skin_is_visual_only(monkeypatch, tmp_path):
+    stand_in_menagerie(tmp_path)
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
     plain = export.standalone_spec().compile()
     dressed = export.standalone_spec(MjcfOptions(skin="menagerie")).compile()
-    assert dressed.ngeom == plain.ngeom + 4 and dressed.nmesh == 4
+    assert dressed.ngeom == plain.ngeom + 8 and dressed.nmesh == 8  # shell and tip of four parts
     assert dressed.body_mass.sum() == pytest.approx(plain.body_mass.sum())
     added = np.flatnonzero(dressed.geom_group == skin.SKIN_GROUP)
     assert not dressed.geom_contype[added].any()
-    assert {dressed.body(dressed.geom_bodyid[g]).name for g in added} == {
-        "arm_link3",
-        "hand_if_px",
-        "neck_link5",
-        "base",
-    }
-    np.testing.assert_allclose(dressed.geom_rgba[added], [[1, 0, 0, 1]] * 4)
+    bodies = {dressed.body(dressed.geom_bodyid[g]).name for g in added}
+    assert bodies == {"arm_link3", "hand_if_px", "neck_link6", "base"}
+    np.testing.assert_allclose(dressed.geom_rgba[added], [[1, 0, 0, 1]] * 8)
+    hidden = {dressed.geom(g).name for g in np.flatnonzero(dressed.geom_group == skin.HIDDEN_GROUP)}
+    assert hidden == {"arm_link3_c", "hand_if_px_box", "base_body"}  # the camera and the mast have no mesh
     path = tmp_path / "out" / "robot.xml"
     export.export_robot(path, MjcfOptions(skin="menagerie"))
-    os.chdir(tmp_path)
-    assert mujoco.MjModel.from_xml_path(str(path)).nmesh == 4
+    monkeypatch.chdir(tmp_path)
+    assert mujoco.MjModel.from_xml_path(str(path)).nmesh == 8
+
+
+def test_menagerie_of_another_layout_is_refused(monkeypatch, tmp_path):
+    stand_in_menagerie(tmp_path)
+    path = tmp_path / "leap_hand" / "right_hand.xml"
+    path.write_text(path.read_text().replace('"if_px"', '"finger"'))
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
+    with pytest.raises(ValueError, match=r"right_hand\.xml has no mesh for the robot's hand"):
+        export.standalone_spec(MjcfOptions(skin="menagerie"))
+
+
+def test_menagerie_package_offline_says_what_to_do(monkeypatch, tmp_path):
+    """The package's interface: `get(name).xml(entry)` downloads, and raises its own error when it cannot."""
+
+    class MenagerieError(Exception):
+        pass
+
+    class Robot:
+        def xml(self, entry):
+            assert entry == "panda_nohand"
+            raise MenagerieError("Name or service not known")
+
+    package = types.SimpleNamespace(MenagerieError=MenagerieError, get=lambda name: Robot())
+    monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", package)
+    with pytest.raises(FileNotFoundError, match=r"franka_emika_panda cannot be had .* set MENAGERIE_ROOT"):
+        export.export_robot(tmp_path / "robot.xml", MjcfOptions(skin="menagerie"))
 
 
 @pytest.mark.parametrize("bad", [{"arm_armature_extra": -1.0}, {"hand_effort": -0.1}, {"skin": "chrome"}])

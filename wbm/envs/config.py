@@ -69,6 +69,7 @@ class RewardConfig:
         goal_height: height above the settled height that the lift term asks for, m.
         goal_width: how sharply, m.
         overshoot_height, overshoot_width: the lift term decays above this height, m.
+        drift_free, drift_width: it decays too beyond this horizontal distance from the settled place, m.
         hold: weight of holding the object above the success height inside the stability term.
         slip_speed, spin_speed: speeds relative to the hand at which the stability term has decayed, m/s and rad/s.
         support_force: hand force on supports and distractors that counts as one collision unit, N.
@@ -94,6 +95,8 @@ class RewardConfig:
     goal_width: float = 0.05
     overshoot_height: float = 0.20
     overshoot_width: float = 0.05
+    drift_free: float = 0.06
+    drift_width: float = 0.08
     hold: float = 2.0
     slip_speed: float = 0.15
     spin_speed: float = 3.0
@@ -101,15 +104,8 @@ class RewardConfig:
     grip_force: float = 15.0
 
     def __post_init__(self) -> None:
-        for name in (
-            "reach_length",
-            "reach_far_length",
-            "goal_width",
-            "overshoot_width",
-            "slip_speed",
-            "spin_speed",
-            "support_force",
-        ):
+        lengths = ("reach_length", "reach_far_length", "goal_width", "overshoot_width", "drift_width")
+        for name in (*lengths, "slip_speed", "spin_speed", "support_force"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"env.reward.{name} must be positive, not {getattr(self, name)}")
 

@@ -25,12 +25,14 @@ from wbm.robot.model import RobotModel
 from wbm.sim.config import SimConfig
 from wbm.sim.simulation import make_simulation
 
+_LIVE = ("episode", "scene", "scene_weight", "elapsed", "ctrl", "previous", "posture")
+
 
 class GraspEnv:
     """N episodes of grasping the target of a scene.
 
     `step` takes a teacher's action [N,A]; `step_targets` takes 32 joint targets, as a student gives them. An episode is
-    determined by (seed, episode number) alone, not by its environment.
+    determined by (seed, episode number) alone, not by its environment (a curriculum adds `scene_weight`).
 
     Attributes:
         obs: the teacher's observation [N,O] of the present state; its labels are `observe.labels`.
@@ -40,6 +42,7 @@ class GraspEnv:
         phase: 0 free space, 1 contact-rich [N].
         started_near: episodes that started at the pre-grasp [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
+        scene_weight: relative chance of every scene [S] to be drawn; equal until a curriculum changes it.
     """
 
     def __init__(
@@ -73,6 +76,7 @@ class GraspEnv:
         self.episode = torch.full((num_envs,), -1, dtype=torch.int64, device=device)
         self.scene = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.elapsed = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.scene_weight = torch.ones(binding.table.count, dtype=torch.float64, device=device)
         self.ctrl = self.sim.ctrl.clone()
         self.noise: Tensor | None = None
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
@@ -124,7 +128,7 @@ class GraspEnv:
 
     def _live(self) -> dict[str, Tensor]:
         """The environment's own state tensors by name."""
-        own = {name: getattr(self, name) for name in ("episode", "scene", "elapsed", "ctrl", "previous", "posture")}
+        own = {name: getattr(self, name) for name in _LIVE}
         parts = {"action": self.action, "hand": self.action.hand, "outcome": self.outcome, "reader": self.reader}
         for part, item in parts.items():
             own |= {f"{part}.{name}": value for name, value in vars(item).items() if name in item.STATE}
@@ -146,7 +150,9 @@ class GraspEnv:
         u = self._uniforms(episodes)
         table = self.binding.table
         if self.cfg.randomization.scene:
-            scenes = (u[:, self._pick].squeeze(1) * table.count).long().clamp_(max=table.count - 1)
+            edges = self.scene_weight.cumsum(0)
+            scenes = torch.searchsorted(edges, u[:, self._pick].squeeze(1).double() * edges[-1], right=True)
+            scenes.clamp_(max=table.count - 1)
         else:
             scenes = torch.from_numpy(episodes % table.count).to(self.device)
         q = self._start_joints(ids, scenes, u)
@@ -199,7 +205,7 @@ class GraspEnv:
         Returns:
             The observation [N,O] (of the next episode where one ended), rewards [N], done flags [N] and a dictionary:
             `time_outs` [N] (ended by time alone), `outcome` [N] (see `outcome.REASONS`, `RUNNING` where it goes on),
-            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step
+            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` and `scene` [N] that the step
             belonged to,
             `ctrl` [N,32] clean joint targets, and `ended`, what the step led to before any restart: `held`, `height`,
             `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
@@ -258,7 +264,7 @@ class GraspEnv:
         reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed & (code != SUCCESS))
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
-        info |= {"ctrl": self.ctrl.clone(), "ended": self._ended()}
+        info |= {"scene": self.scene.clone(), "ctrl": self.ctrl.clone(), "ended": self._ended()}
         ids = done.nonzero().squeeze(1)
         if len(ids):
             self._begin(ids)

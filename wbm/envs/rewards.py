@@ -34,11 +34,14 @@ def grasp(s: GraspState, c: RewardConfig) -> Tensor:
 
 
 def lift(s: GraspState, c: RewardConfig) -> Tensor:
-    """Height above the settled height up to the goal, paid for opposition, decaying where the object is flung."""
+    """Height above the settled height up to the goal, paid for opposition, decaying where the object is flung or
+    carried away.
+    """
     rise = (s.height / c.goal_height).clamp(0.0, 1.0)
     near = 0.5 * torch.exp(-(s.height - c.goal_height).abs() / c.goal_width)
     overshoot = torch.exp(-(s.height - c.overshoot_height).clamp(min=0.0) / c.overshoot_width)
-    return (c.lift_open + (1 - c.lift_open) * s.opposition) * (rise + near * rise) * overshoot
+    away = torch.exp(-(s.drift - c.drift_free).clamp(min=0.0) / c.drift_width)
+    return (c.lift_open + (1 - c.lift_open) * s.opposition) * (rise + near * rise) * overshoot * away
 
 
 def stable(s: GraspState, c: RewardConfig) -> Tensor:

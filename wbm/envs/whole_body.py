@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor
 
+from wbm.control.base_path import BaseMap, Obstacles, base_path
 from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
 from wbm.robot import joints
@@ -14,6 +16,10 @@ from wbm.robot import joints
 FREE, CONTACT = 0, 1
 NEAR_WAYPOINT = (0.05, 0.3)  # m and rad at which the waypoint counts as passed
 NEAR_PREGRASP = (0.02, 0.15)
+MAX_CORNERS = 12
+NEAR_CORNER = 0.15  # m at which a corner of the base's way counts as passed
+CARROT = 1.0  # m ahead of the base at which its target moves along the way
+DETOUR_WEIGHTS = {"ee_position": 0.0, "ee_rotation": 0.0, "posture": 0.1, "posture_base": 1.0}
 
 
 class WholeBodyEnv(GraspEnv):
@@ -23,8 +29,9 @@ class WholeBodyEnv(GraspEnv):
     In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed
     in the
     world (a target that followed the base would make the controller chase itself), and the posture is the
-    pre-grasp's. A
-    teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves through both phases alike.
+    pre-grasp's. Where obstacles block the straight way of the base, the base first follows the planner's corners with
+    the arm held as it is. A teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves
+    through both phases alike.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -36,6 +43,14 @@ class WholeBodyEnv(GraspEnv):
         self._contact_since = torch.zeros(n, dtype=torch.int64, device=device)
         self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
         self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
+        self._corner = torch.zeros(n, MAX_CORNERS, 2, device=device)
+        self._corners, self._corner_at = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(2))
+        self._start_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
+        names: list[str] = list(self.controller.weight_names)
+        weights = wp.to_torch(self.controller.weights)
+        self._detour = [
+            (weights[:, names.index(k)], v, weights[0, names.index(k)].item()) for k, v in DETOUR_WEIGHTS.items()
+        ]
 
     @property
     def limit_steps(self) -> int:
@@ -50,7 +65,23 @@ class WholeBodyEnv(GraspEnv):
         self._stage[ids], self._contact_since[ids] = 0, 0
         away = self.binding.table.q_start[scenes].to(goal)
         away[:, joints.HAND] = goal[:, joints.HAND]
-        return torch.where(near.unsqueeze(1), goal, away)
+        start = torch.where(near.unsqueeze(1), goal, away)
+        self._corners[ids], self._corner_at[ids], self._start_q[ids] = 0, 0, start
+        far = ~near
+        self._plan(ids[far], scenes[far], start[far], goal[far])
+        return start
+
+    def _plan(self, ids: Tensor, scenes: Tensor, start: Tensor, goal: Tensor) -> None:
+        """Corners of the base's way from `start` to `goal` [K,32]; none where the straight one is free."""
+        t = self.binding.table
+        for env, scene, a, b in zip(
+            ids.tolist(), scenes.tolist(), start.cpu().numpy(), goal.cpu().numpy(), strict=True
+        ):
+            rows = (t.obstacle_type, t.obstacle_size, t.obstacle_pos, t.obstacle_quat)
+            there = BaseMap(self.robot, a, float(b[2]), Obstacles(*(r[scene].cpu().numpy() for r in rows)))
+            corners = base_path(there, a[:2].astype(float), b[:2].astype(float))[:MAX_CORNERS]
+            self._corner[env, : len(corners)] = torch.as_tensor(corners, dtype=torch.float32)
+            self._corners[env] = len(corners)
 
     def _begin(self, ids: Tensor) -> None:
         super()._begin(ids)
@@ -78,6 +109,7 @@ class WholeBodyEnv(GraspEnv):
         contact = (self.phase == CONTACT).unsqueeze(1)
         action = action * contact
         self.action.apply(action, s.q, s.ee_pos_w, s.ee_quat)
+        self._follow()
         self._approach(~contact.squeeze(1))
         self._command()
         return self._advance(action)
@@ -119,6 +151,31 @@ class WholeBodyEnv(GraspEnv):
         term.quat.copy_(torch.where(keep, term.quat, turned / turned.norm(dim=-1, keepdim=True)))
         hand = self._goal_q[:, joints.HAND].to(term.hand.target)
         term.hand.target.copy_(torch.where(keep, term.hand.target, hand))
+
+    def _follow(self) -> None:
+        """Lead the base along its corners; where none is left, the hand's own approach begins from where it is."""
+        s, at = self.state, self._corner_at
+        on = (self.phase == FREE) & (at < self._corners)
+        ids = torch.arange(self.num_envs, device=self.device)
+        base = s.q[:, :2].float()
+        away = self._corner[ids, at.clamp(max=MAX_CORNERS - 1)] - base
+        distance = away.norm(dim=-1, keepdim=True)
+        at += (on & (distance.squeeze(1) < NEAR_CORNER)).long()
+        ended = (on & (at >= self._corners)).nonzero().squeeze(1)
+        on &= at < self._corners
+        row = on.unsqueeze(1)
+        for weight, detour, usual in self._detour:
+            weight.copy_(torch.where(on, detour, usual))
+        way = self._start_q[:, self._body].clone()
+        way[:, :2] = base + away * (CARROT / distance.clamp_min(1e-6))
+        way[:, 2] = self._goal_q[:, 2]
+        goal = self._goal_q[:, self._body].to(self.posture)
+        self.posture.copy_(
+            torch.where(row, way.to(self.posture), torch.where(self._corners.unsqueeze(1) > 0, goal, self.posture))
+        )
+        hold = torch.cat([ids[on], ended])
+        if len(hold):
+            self.action.reset(hold, s.q[hold].float(), s.ee_pos_w[hold], s.ee_quat[hold])
 
 
 def _towards(start: Tensor, goal: Tensor, step: float) -> Tensor:

@@ -17,7 +17,6 @@ from wbm.envs.perception import Perception
 from wbm.envs.rollout_config import RolloutsConfig
 from wbm.envs.world import GRASPS, WorldConfig, make_env, scene_rows, with_start
 from wbm.learning.router import RoutedTeacher, load_suite
-from wbm.robot.model import load_robot
 from wbm.robot.schema import PolicySchema
 from wbm.scenes.assets import Assets, load_assets
 from wbm.scenes.config import KINDS
@@ -72,11 +71,11 @@ class RolloutWorld:
         world = replace(world, sim=replace(physics, engine=world.sim.engine, threads=1))
         rows = scene_rows(self.assets.scenes, "train", KINDS, tuple(g for g in GRASPS if g in suite))
         seed = job.seed + job.rollouts.seed_offset
-        self.env = make_env(self.assets, world, rows, job.rollouts.num_envs, seed, job.device)
-        self.bank = self.assets.scenes.select(self.env.binding.scenes)
+        self.env = make_env(self.assets, world, rows, job.rollouts.num_envs, seed, job.device, grasps=tuple(suite))
+        self.bank = self.env.binding.bank.select(self.env.binding.scenes)
         self.teacher = RoutedTeacher(suite, self.env)
         self.perception = Perception(
-            load_robot(),
+            self.env.robot,
             self.assets.objects,
             self.bank,
             job.sensors,

@@ -13,7 +13,6 @@ import warp as wp
 
 from wbm.control.links import LinkPoses
 from wbm.report.video import film_frame, follow_camera, jpeg_bytes, key_steps, write_mp4
-from wbm.robot.model import load_robot
 from wbm.scenes.assets import Assets
 from wbm.sensors.instances import SceneInstances, hull_meshes
 from wbm.sensors.render import Renderer
@@ -38,12 +37,11 @@ class FilmStudio:
 
     def __init__(self, assets: Assets, size: tuple[int, int]) -> None:
         self.size = size
-        robot = load_robot()
-        self.links = LinkPoses(robot, 1)
-        self.instances = SceneInstances(robot, assets.objects, assets.scenes)
+        self.links = LinkPoses(assets.robot, 1)
+        self.instances = SceneInstances(assets.robot, assets.objects, assets.scenes)
         self.scene = RayScene(1, self.instances.num_bodies, self.instances.count, hull_meshes(assets.objects))
         self._pos, self._quat = wp.to_torch(self.scene.body_pos), wp.to_torch(self.scene.body_quat)
-        self._housing = robot.frames["camera"].link
+        self._housing = assets.robot.frames["camera"].link
         self._renderers: dict[tuple[int, int, float], Renderer] = {}
 
     def _draw(self, scene: Any, env: int, pos: Any, quat: Any, width: int, height: int, fov_deg: float) -> np.ndarray:

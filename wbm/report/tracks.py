@@ -146,7 +146,7 @@ def robot_tracks(robot: RobotModel | None = None, seconds: float = 16.0, rate_hz
 def scene_tracks(assets: Any, scene: int) -> EpisodeTracks:
     """A scene of the bank with the robot at its start."""
     q = np.asarray(assets.scenes.q_start[scene], dtype=np.float64)[None]
-    tracks = EpisodeTracks(times=np.zeros(1), joint_names=joints.JOINT_NAMES, q=q, frames=frame_tracks(load_robot(), q))
+    tracks = EpisodeTracks(times=np.zeros(1), joint_names=joints.JOINT_NAMES, q=q, frames=frame_tracks(assets.robot, q))
     return EpisodeTracks(**{**tracks.__dict__, "solids": scene_solids(assets, scene)})
 
 

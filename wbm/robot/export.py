@@ -21,9 +21,10 @@ def standalone_spec(options: MjcfOptions | None = None, spheres: bool = False) -
 
     Raises:
         FileNotFoundError: `skin=menagerie` and the meshes cannot be had.
+        FactsError: `facts` makes no robot.
     """
     options = options or MjcfOptions()
-    robot = load_robot()
+    robot = load_robot(options.facts)
     spec = mujoco.MjSpec()
     spec.modelname = "wbm"
     spec.option.timestep = 0.004

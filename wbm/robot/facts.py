@@ -1,8 +1,9 @@
-"""Reads the published kinematic and inertial facts of the platform's parts."""
+"""Reads the facts from which the robot is built: published numbers of the parts, and how they make one robot."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,41 +11,152 @@ from typing import Any
 import numpy as np
 import yaml
 
-FACTS_PATH = Path(__file__).with_name("facts.yaml")
-_IDENTITY = (1.0, 0.0, 0.0, 0.0)
+STANDARD = ("facts.yaml", "platform.yaml")
+"""Beside this file: the published numbers, and this project's own choices. A user's file is laid over both."""
+
+MAX_BYTES = 1 << 20
+_MISSING = object()
+
+
+class FactsError(ValueError):
+    """Facts that make no robot; the message names the file, the field and what it should be."""
 
 
 @dataclass(frozen=True)
-class Inertial:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), all in the link frame."""
+class Entry:
+    """A value of a facts file that knows its place, so that every complaint names the field."""
 
-    mass: float
-    com: np.ndarray
-    inertia: np.ndarray  # [3,3]
+    value: Any
+    file: str
+    place: str = ""
+
+    def error(self, reason: str) -> FactsError:
+        """What to raise about this entry."""
+        return FactsError(f"{self.file}: {self.place or 'the file'}: {reason}")
+
+    def get(self, key: str) -> Entry | None:
+        """The entry below `key`, or None; the entry itself must be a mapping."""
+        if not isinstance(self.value, dict):
+            raise self.error("must be a mapping")
+        found = self.value.get(key, _MISSING)
+        if found is _MISSING or found is None:
+            return None
+        return Entry(found, self.file, f"{self.place}.{key}" if self.place else key)
+
+    def __getitem__(self, key: str) -> Entry:
+        found = self.get(key)
+        if found is None:
+            raise self.error(f"{key} is missing")
+        return found
+
+    def items(self) -> Iterator[tuple[str, Entry]]:
+        """Keys and entries of a mapping."""
+        if not isinstance(self.value, dict):
+            raise self.error("must be a mapping")
+        return ((str(key), self[key]) for key in self.value)
+
+    def each(self) -> list[Entry]:
+        """Entries of a list."""
+        if not isinstance(self.value, list):
+            raise self.error("must be a list")
+        return [Entry(item, self.file, f"{self.place}[{i}]") for i, item in enumerate(self.value)]
+
+    def word(self) -> str:
+        """A name."""
+        if not isinstance(self.value, str) or not self.value:
+            raise self.error("must be a name")
+        return self.value
+
+    def number(self, above: float = -np.inf) -> float:
+        """A finite number greater than `above`; text that spells one will do, as in MJCF."""
+        try:
+            value = float(self.value)
+        except (TypeError, ValueError):
+            raise self.error("must be a number") from None
+        if not np.isfinite(value) or not value > above:
+            raise self.error("must be a finite number" + (f" above {above:g}" if np.isfinite(above) else ""))
+        return value
+
+    def vector(self, count: int) -> np.ndarray:
+        """Finite numbers [count]: a list, or text with spaces, as in MJCF."""
+        items = self.value.split() if isinstance(self.value, str) else self.value
+        try:
+            vector = np.array(items, dtype=np.float64)
+        except (TypeError, ValueError):
+            vector = np.empty(0)
+        if vector.shape != (count,) or not np.isfinite(vector).all():
+            raise self.error(f"must be {count} finite numbers")
+        return vector
+
+    def quat(self) -> np.ndarray:
+        """A rotation [4] (w x y z), scaled to unit length."""
+        vector = self.vector(4)
+        if np.linalg.norm(vector) < 1e-6:
+            raise self.error("must be a quaternion w x y z that is not zero")
+        return unit_quat(vector)
 
 
-@dataclass(frozen=True)
-class PartLink:
-    """One link of a published description: its pose in its parent, joint and inertia."""
+def read_facts(path: str | Path) -> bytes:
+    """The bytes of a user's facts file.
 
-    name: str
-    parent: str | None
-    pos: np.ndarray
-    quat: np.ndarray  # w x y z, unit
-    inertial: Inertial | None
-    joint: dict[str, Any] | None
-    boxes: tuple[dict[str, Any], ...] = field(default=())
+    Raises:
+        OSError: the file cannot be read.
+        FactsError: it is larger than any facts file.
+    """
+    place = Path(path).expanduser()
+    if place.stat().st_size > MAX_BYTES:
+        raise FactsError(f"{path}: larger than {MAX_BYTES >> 20} MB, which no facts file is")
+    return place.read_bytes()
+
+
+def parse_facts(own: bytes = b"", file: str = "wbm's own facts") -> Entry:
+    """The standard facts, with a user's laid over them: mappings key by key, parts and lists as a whole.
+
+    Args:
+        own: YAML; nothing leaves the standard facts as they are.
+        file: what errors call it.
+
+    Raises:
+        FactsError: no YAML mapping, or a section that is unknown.
+    """
+    standard = _standard()
+    if not own:
+        return Entry(standard, file)
+    try:
+        changes = _parse(own)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise FactsError(f"{file}: is not YAML ({' '.join(str(error).split())[:160]})") from None
+    if not isinstance(changes, dict):
+        raise FactsError(f"{file}: must be a mapping with sections such as parts, mounts or joints")
+    entry = Entry(_laid_over(standard, changes), file)
+    named = {part.word() for _, part in entry["parts"].items()}
+    for key in changes:
+        if key not in standard and key not in named:
+            raise FactsError(f"{file}: {key}: is no section, and no group of `parts` is made of it")
+    return entry
+
+
+def _laid_over(base: Any, own: Any) -> Any:
+    if not (isinstance(base, dict) and isinstance(own, dict)):
+        return own
+    # A mapping with `bodies` is a part: it replaces the published one as a whole.
+    if "bodies" in own:
+        return own
+    return base | {key: _laid_over(base[key], value) if key in base else value for key, value in own.items()}
+
+
+def _parse(data: bytes) -> Any:
+    return yaml.load(data, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+
+
+def standard_text() -> str:
+    """The standard facts as the YAML that they are read from, with comments."""
+    return "\n".join(Path(__file__).with_name(name).read_text(encoding="utf-8") for name in STANDARD)
 
 
 @cache
-def load_facts(path: Path = FACTS_PATH) -> dict[str, Any]:
-    """Parse a facts file.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-    """
-    with open(path, encoding="utf-8") as stream:
-        return yaml.load(stream, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+def _standard() -> dict[str, Any]:
+    return _parse(standard_text().encode())
 
 
 def unit_quat(quat: Any) -> np.ndarray:
@@ -62,39 +174,3 @@ def quat_to_mat(quat: np.ndarray) -> np.ndarray:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def part_links(part: str, path: Path = FACTS_PATH) -> tuple[PartLink, ...]:
-    """All links of a part, parents first, in published order."""
-    links: list[PartLink] = []
-
-    def visit(node: dict[str, Any], parent: str | None) -> None:
-        links.append(
-            PartLink(
-                name=node["name"],
-                parent=parent,
-                pos=np.asarray(node.get("pos", (0.0, 0.0, 0.0)), dtype=np.float64),
-                quat=unit_quat(node.get("quat", _IDENTITY)),
-                inertial=_inertial(node.get("inertial")),
-                joint=node.get("joint"),
-                boxes=tuple(node.get("primitive_geoms", ())),
-            )
-        )
-        for child in node.get("children", ()):
-            visit(child, node["name"])
-
-    for body in load_facts(path)[part]["bodies"]:
-        visit(body, None)
-    return tuple(links)
-
-
-def _inertial(node: dict[str, Any] | None) -> Inertial | None:
-    if node is None:
-        return None
-    if "fullinertia" in node:  # xx yy zz xy xz yz
-        xx, yy, zz, xy, xz, yz = node["fullinertia"]
-        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    else:
-        rot = quat_to_mat(unit_quat(node.get("quat", _IDENTITY)))
-        inertia = rot @ np.diag(node["diaginertia"]) @ rot.T
-    return Inertial(float(node["mass"]), np.asarray(node["com"], dtype=np.float64), inertia)

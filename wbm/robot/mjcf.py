@@ -16,6 +16,8 @@ from wbm.robot.spheres import moving_joints
 ROBOT_BIT, OBJECT_BIT, STATIC_BIT = 1, 2, 4
 """Collision bits: everything collides with everything, but statics and unused slots not with statics."""
 
+PRIMITIVE_GROUP = 1  # visible in MuJoCo's viewer; a skin hides it
+
 BASE_JOINT_LINKS = ("base_x", "base_y")  # massless links whose joints MuJoCo keeps on the base's body
 FORCE_DATA = (1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)) | (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE))
 NET_FORCE = 3  # mjtConReduce: net wrench about the force-weighted centroid, in the world frame
@@ -76,7 +78,7 @@ def _add_links(spec: mujoco.MjSpec, robot: RobotModel, options: MjcfOptions) -> 
             rgba=[*geom.rgb, 1.0],
             contype=ROBOT_BIT,
             conaffinity=ROBOT_BIT | OBJECT_BIT | STATIC_BIT,
-            group=1,
+            group=PRIMITIVE_GROUP,
         )
     for name, frame in robot.frames.items():
         bodies[frame.link].add_site(name=name, pos=frame.pos, quat=frame.quat, size=[0.005] * 3, group=4)
@@ -159,10 +161,9 @@ def add_contact_sensors(spec: mujoco.MjSpec, target: str, distractors: Sequence[
     """
     body, subtree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
     rows: list[tuple[str, mujoco.mjtObj, str, str]] = []
-    for finger, prefix in joints.FINGER_PREFIX.items():
-        root = f"hand_{prefix}_{'mp' if prefix == 'th' else 'bs'}"
-        rows.append((f"tip_{finger}", body, f"hand_{prefix}_ds", target))
-        rows.append((f"finger_{finger}", subtree, root, target))
+    for finger in joints.FINGERS:
+        rows.append((f"tip_{finger}", body, joints.FINGER_TIP[finger], target))
+        rows.append((f"finger_{finger}", subtree, joints.FINGER_ROOT[finger], target))
     rows += [
         ("palm", body, "hand_palm", target),
         ("robot_target", subtree, "base", target),
@@ -187,7 +188,8 @@ def add_contact_sensors(spec: mujoco.MjSpec, target: str, distractors: Sequence[
 
 def robot_spec(options: MjcfOptions | None = None) -> mujoco.MjSpec:
     """A spec that holds the robot alone."""
+    options = options or MjcfOptions()
     spec = mujoco.MjSpec()
     spec.modelname = "wbm"
-    build_robot(spec, load_robot(), options)
+    build_robot(spec, load_robot(options.facts), options)
     return spec

@@ -1,45 +1,27 @@
-"""The robot as one kinematic tree with limits, frames and collision geometry (NumPy only).
-
-How the parts are mounted on each other is this project's own choice: the arm stands on the base's front half, the
-LEAP hand's palm faces along the flange axis (so that fingers and thumb close around what the flange points at), the
-neck stands on a mast at the rear left, the LiDAR at the front right corner.
-"""
+"""The robot as one kinematic tree with limits, frames and collision geometry (NumPy only), assembled from facts."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wbm.robot import joints
-from wbm.robot.facts import Inertial, PartLink, load_facts, part_links, quat_to_mat, unit_quat
-from wbm.robot.geometry import Geom, robot_geoms
+from wbm.robot.facts import Entry, parse_facts, quat_to_mat, read_facts, unit_quat
+from wbm.robot.geometry import Geom, read_geoms
+from wbm.robot.parts import Inertial, PartJoint, PartLink, joint_range, part_links
 
 FIXED, HINGE, SLIDE = 0, 1, 2
 
-ARM_MOUNT = (0.08, 0.0, 0.335)
-NECK_MOUNT = (-0.15, 0.15, 0.525)
-LIDAR_MOUNT = (0.185, -0.185, 0.3575)
-HAND_MOUNT_POS = (-0.030, 0.0225, 0.034)  # palm origin in the flange frame: the grasp centre lies on its z axis
-HAND_MOUNT_QUAT = (0.0, 0.0, 1.0, 0.0)  # palm -z along the flange z, fingers forward in the ready pose
-CAMERA_MASS = 0.072 + 0.1  # D435 and its bracket replace the PiPER's gripper (1.2 kg link6)
+GROUPS = ("arm", "hand", "neck")
+"""The groups that are made of parts, in the order in which they are added to the tree."""
 
-BASE_RANGE = np.array([[-10.0, 10.0], [-10.0, 10.0], [-2 * np.pi, 2 * np.pi]])
-BASE_KP, BASE_KV = np.array([2.0e4, 2.0e4, 4.0e3]), np.array([2.0e3, 2.0e3, 4.0e2])
-BASE_EFFORT = np.array([400.0, 400.0, 120.0])
-NECK_KP, NECK_KV, NECK_EFFORT = 300.0, 30.0, 25.0
-HAND_EFFORT = 0.95  # N m, stall torque of the LEAP's Dynamixel XC330-M288 at 5 V
-
-Q_HOME = np.concatenate(
-    [
-        [0.0, 0.0, 0.0],
-        [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785],
-        [0.3, 0.0, 0.4, 0.3] * 3,
-        [0.9, 0.9, 0.2, 0.2],
-        [0.26, 2.10, -2.24, -0.74, 0.97, 0.83],  # looks at (0.8, 0, 0.62), 5 cm clear of the arm
-    ]
-)
+FRAMES = ("ee", "palm", "camera", "lidar", "base", "tip_index", "tip_middle", "tip_ring", "tip_thumb")
+BASE_LINKS = ("base_x", "base_y", "base")
+LIDAR_SIZE = np.array([0.075, 0.075, 0.065])
 
 
 @dataclass(frozen=True)
@@ -56,7 +38,8 @@ class RobotModel:
     """Kinematic tree of L links over 32 joints; see `docs/architecture.md` for the meaning of each field.
 
     Shapes: `parent`, `joint_type`, `joint_index` [L]; `link_pos`, `joint_axis` [L,3]; `link_quat` [L,4] (w x y z);
-    limits and gains [32]. Units: m, rad, s, N or N m.
+    limits and gains [32]. Units: m, rad, s, N or N m. `facts`: the user's facts file that it was made of, empty for the
+    standard robot.
     """
 
     link_names: tuple[str, ...]
@@ -81,187 +64,191 @@ class RobotModel:
     q_home: np.ndarray
     frames: dict[str, Frame]
     geoms: tuple[Geom, ...]
+    facts: bytes = b""
 
     def link(self, name: str) -> int:
         """Index of a link by name."""
         return self.link_names.index(name)
 
 
-@dataclass
-class _Dof:
-    """Per-joint numbers gathered while the tree is built."""
+def load_robot(facts: str | Path = "") -> RobotModel:
+    """Assemble base, arm, hand and neck into one model (cached by content: the result is immutable).
 
-    rng: tuple[float, float]
-    kp: float
-    kv: float
-    effort: float
-    armature: float = 0.0
-    damping: float = 0.0
-    frictionloss: float = 0.0
+    Args:
+        facts: a user's facts file, laid over the standard ones; empty for the standard robot.
 
-
-class _Tree:
-    def __init__(self) -> None:
-        self.names: list[str] = []
-        self.rows: list[tuple] = []
-        self.dofs: dict[str, _Dof] = {}
-
-    def add(self, name, parent, pos, quat, inertial=None, joint=None, kind=FIXED, axis=(0, 0, 1)) -> None:
-        index = joints.JOINT_NAMES.index(joint) if joint else -1
-        parent_index = self.names.index(parent) if parent else -1
-        self.names.append(name)
-        self.rows.append((parent_index, pos, unit_quat(quat), kind, axis, index, inertial))
-
-    def add_part(self, prefix: str, links: tuple[PartLink, ...], parent: str, pos, quat, dof_of) -> None:
-        for link in links:
-            root = link.parent is None
-            joint = f"{prefix}_{link.joint['name']}" if link.joint else None
-            self.add(
-                f"{prefix}_{link.name}",
-                parent if root else f"{prefix}_{link.parent}",
-                pos if root else link.pos,
-                quat if root else link.quat,
-                link.inertial,
-                joint,
-                HINGE if joint else FIXED,
-                link.joint["axis"] if link.joint else (0, 0, 1),
-            )
-            if joint:
-                self.dofs[joint] = dof_of(link.joint)
+    Raises:
+        OSError: the file cannot be read.
+        FactsError: it makes no robot; the message names the field.
+    """
+    return _assemble(read_facts(facts), str(facts)) if str(facts) else _assemble()
 
 
 @cache
-def load_robot() -> RobotModel:
-    """Assemble base, arm, hand and neck into one model (cached: the result is immutable)."""
-    facts = load_facts()
+def _assemble(own: bytes = b"", file: str = "") -> RobotModel:
+    facts = parse_facts(own, file)
     tree = _Tree()
-    identity = (1.0, 0.0, 0.0, 0.0)
-    tree.add("world", None, (0, 0, 0), identity)
-    for i, (name, link, axis) in enumerate(
-        [("base_x", "base_x", (1, 0, 0)), ("base_y", "base_y", (0, 1, 0)), ("base_yaw", "base", (0, 0, 1))]
-    ):
-        parent = ("world", "base_x", "base_y")[i]
-        inertial = _base_inertial(facts) if link == "base" else None
-        tree.add(link, parent, (0, 0, 0), identity, inertial, name, HINGE if i == 2 else SLIDE, axis)
-        tree.dofs[name] = _Dof(tuple(BASE_RANGE[i]), BASE_KP[i], BASE_KV[i], BASE_EFFORT[i])
-    tree.add("lidar_body", "base", LIDAR_MOUNT, identity, _lidar_inertial(facts))
-
-    panda = {a["joint"]: a for a in facts["panda"]["actuators"]}
-
-    def arm_dof(joint: dict) -> _Dof:
-        act = panda[joint["name"]]
-        kv = -float(str(act["biasprm"]).split()[2])
-        effort = float(str(act["forcerange"]).split()[1])
-        return _Dof(tuple(joint["range"]), float(act["gainprm"]), kv, effort, joint["armature"], joint["damping"])
-
-    tree.add_part("arm", part_links("panda"), "base", ARM_MOUNT, identity, arm_dof)
-
-    leap = {a["joint"]: a for a in facts["leap_right"]["actuators"]}
-
-    def hand_dof(joint: dict) -> _Dof:
-        act = leap[joint["name"]]
-        return _Dof(
-            tuple(joint["range"]),
-            float(act["kp"]),
-            float(act["kv"]),
-            HAND_EFFORT,
-            0.0,
-            joint["damping"],
-            joint["frictionloss"],
-        )
-
-    tree.add_part("hand", part_links("leap_right"), "arm_attachment", HAND_MOUNT_POS, HAND_MOUNT_QUAT, hand_dof)
-
-    loss = facts["piper"]["joint_armature_damping_frictionloss_published"]
-
-    def neck_dof(joint: dict) -> _Dof:
-        return _Dof(
-            tuple(joint["range"]),
-            NECK_KP,
-            NECK_KV,
-            NECK_EFFORT,
-            loss["armature"],
-            loss["damping"],
-            loss["frictionloss"],
-        )
-
-    neck = tuple(_with_camera(link) for link in part_links("piper"))
-    tree.add_part("neck", neck, "base", NECK_MOUNT, identity, neck_dof)
-    return _finish(tree)
+    tree.add(PartLink("world", None, np.zeros(3), _IDENTITY, None, None), None)
+    _add_base(tree, facts)
+    for group in GROUPS:
+        name = facts["parts"][group].word()
+        links = part_links(facts[name])
+        _check_part(facts[name], group, links)
+        tree.add_part(group, links, facts["mounts"][group])
+    replaced = facts.get("inertials")
+    for link in replaced.value if replaced else ():
+        if (box := replaced.get(link)) is not None:  # pyright: ignore[reportOptionalMemberAccess]
+            tree.links[tree.index(link, box)] = replace(tree.links[tree.index(link, box)], inertial=_solid_box(box))
+    return replace(_finish(tree, facts), facts=own)
 
 
-def _finish(tree: _Tree) -> RobotModel:
-    rows = list(zip(*tree.rows, strict=True))
-    dofs = [tree.dofs[name] for name in joints.JOINT_NAMES]
-    rng = np.array([d.rng for d in dofs])
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
-    def frame(link: str, pos=(0.0, 0.0, 0.0), quat=(1.0, 0.0, 0.0, 0.0)) -> Frame:
-        return Frame(tree.names.index(link), np.asarray(pos, float), unit_quat(quat))
 
-    # The grasp frame E: z = -z_palm (approach), x = x_palm (stretched fingers), centred between fingers and thumb.
-    frames = {
-        "ee": frame("hand_palm", (-0.030, -0.0225, -0.085), (0.0, 1.0, 0.0, 0.0)),
-        "palm": frame("hand_palm"),
-        "camera": frame("neck_link6", (0.0, 0.0, 0.0425), CAMERA_QUAT),
-        "lidar": frame("lidar_body"),
-        "base": frame("base"),
-        "tip_index": frame("hand_if_ds", (0.0, -0.036, 0.015)),
-        "tip_middle": frame("hand_mf_ds", (0.0, -0.036, 0.015)),
-        "tip_ring": frame("hand_rf_ds", (0.0, -0.036, 0.015)),
-        "tip_thumb": frame("hand_th_ds", (0.0, -0.045, -0.015)),
-    }
+class _Tree:
+    """Links with full names, parents first, each with its joint's type and index into q."""
+
+    def __init__(self) -> None:
+        self.links: list[PartLink] = []
+        self.parent: list[int] = []
+        self.kind: list[int] = []
+
+    def index(self, name: str, entry: Entry) -> int:
+        for i, link in enumerate(self.links):
+            if link.name == name:
+                return i
+        raise entry.error(f"no link is called {name}")
+
+    def add(self, link: PartLink, parent: int | None, kind: int = FIXED) -> None:
+        self.links.append(link)
+        self.parent.append(-1 if parent is None else parent)
+        self.kind.append(kind)
+
+    def add_part(self, group: str, links: tuple[PartLink, ...], mount: Entry) -> None:
+        """Hang the links of a part below the mount's link; the mount takes the place of the root's own pose."""
+        names = {link.name: len(self.links) + i for i, link in enumerate(links)}
+        for link in links:
+            joint = replace(link.joint, name=f"{group}_{link.joint.name}") if link.joint else None
+            moved = replace(link, name=f"{group}_{link.name}", joint=joint)
+            if link.parent is None:
+                parent = self.index(mount["link"].word(), mount["link"])
+                pos, quat = _pose(mount)
+                self.add(replace(moved, pos=pos, quat=quat), parent, HINGE if joint else FIXED)
+            else:
+                self.add(moved, names[link.parent], HINGE if joint else FIXED)
+
+
+def _pose(entry: Entry) -> tuple[np.ndarray, np.ndarray]:
+    pos, quat = entry.get("pos"), entry.get("quat")
+    return pos.vector(3) if pos else np.zeros(3), quat.quat() if quat else _IDENTITY
+
+
+def _check_part(part: Entry, group: str, links: tuple[PartLink, ...]) -> None:
+    expected = [name.removeprefix(f"{group}_") for name in joints.JOINT_NAMES[joints.GROUPS[group]]]
+    found = [link.joint.name for link in links if link.joint]
+    if sorted(found) != sorted(expected):
+        raise part.error(f"a part for {group} must have the joints {', '.join(expected)}; it has {', '.join(found)}")
+    if sum(link.parent is None for link in links) != 1:
+        raise part["bodies"].error("must be one tree of links")
+    if group == "hand":
+        needed = {"hand_palm", *joints.FINGER_ROOT.values(), *joints.FINGER_TIP.values()}
+        missing = sorted(needed - {f"hand_{link.name}" for link in links})
+        if missing:
+            raise part.error(f"a hand must have the links {', '.join(m.removeprefix('hand_') for m in missing)}")
+
+
+def _add_base(tree: _Tree, facts: Entry) -> None:
+    """Two massless links slide along x and y, the base turns on them; the LiDAR is fixed to it."""
+    body = facts["tidybot2_base"]["parts_aabb_m"]["body"]
+    low, high = body["min"].vector(3), body["max"].vector(3)
+    mass = facts["tidybot2_base"]["mass"].number(above=0.0)
+    for i, (name, joint) in enumerate(zip(BASE_LINKS, joints.JOINT_NAMES[joints.BASE], strict=True)):
+        axis = np.eye(3)[i]
+        inertial = _box_inertial(mass, (low + high) / 2, high - low) if name == "base" else None
+        hinge = PartJoint(joint, axis, np.zeros(2), 0.0, 0.0, 0.0, None, None, None)
+        tree.add(PartLink(name, None, np.zeros(3), _IDENTITY, inertial, hinge), i, HINGE if i == 2 else SLIDE)
+    mount = facts["mounts"]["lidar"]
+    inertial = _box_inertial(facts["unitree_l2"]["mass_kg"].number(above=0.0), np.zeros(3), LIDAR_SIZE)
+    lidar = PartLink("lidar_body", None, *_pose(mount), inertial, None)
+    tree.add(lidar, tree.index(mount["link"].word(), mount["link"]))
+
+
+def _finish(tree: _Tree, facts: Entry) -> RobotModel:
+    of_joint = {link.joint.name: link.joint for link in tree.links if link.joint}
+    published = [of_joint[name] for name in joints.JOINT_NAMES]
+    limits = _joint_numbers(facts["joints"], published)
+    frames = {}
+    for name, entry in facts["frames"].items():
+        frames[name] = Frame(tree.index(entry["link"].word(), entry["link"]), *_pose(entry))
+    for name in FRAMES:
+        facts["frames"][name]  # the rest of the project relies on it
+    geoms = read_geoms(facts)
+    for geom in geoms:
+        if geom.link not in {link.name for link in tree.links[3:]}:
+            raise facts["geometry"].error(f"{geom.name}: no link is called {geom.link}")
     return RobotModel(
-        link_names=tuple(tree.names),
-        parent=np.array(rows[0], dtype=np.int32),
-        link_pos=np.array(rows[1], dtype=np.float64),
-        link_quat=np.array(rows[2], dtype=np.float64),
-        joint_type=np.array(rows[3], dtype=np.int32),
-        joint_axis=np.array(rows[4], dtype=np.float64),
-        joint_index=np.array(rows[5], dtype=np.int32),
-        inertials=tuple(rows[6]),
+        link_names=tuple(link.name for link in tree.links),
+        parent=np.array(tree.parent, dtype=np.int32),
+        link_pos=np.array([link.pos for link in tree.links]),
+        # Normalised a second time: the last bits are those that published results were made with.
+        link_quat=np.array([unit_quat(link.quat) for link in tree.links]),
+        joint_type=np.array(tree.kind, dtype=np.int32),
+        joint_axis=np.array([link.joint.axis if link.joint else (0.0, 0.0, 1.0) for link in tree.links]),
+        joint_index=np.array(
+            [joints.JOINT_NAMES.index(link.joint.name) if link.joint else -1 for link in tree.links], dtype=np.int32
+        ),
+        inertials=tuple(link.inertial for link in tree.links),
         joint_names=joints.JOINT_NAMES,
-        q_min=rng[:, 0],
-        q_max=rng[:, 1],
-        qd_max=joints.QD_MAX.copy(),
-        qdd_max=joints.QDD_MAX.copy(),
-        effort=np.array([d.effort for d in dofs]),
-        kp=np.array([d.kp for d in dofs]),
-        kv=np.array([d.kv for d in dofs]),
-        armature=np.array([d.armature for d in dofs]),
-        damping=np.array([d.damping for d in dofs]),
-        frictionloss=np.array([d.frictionloss for d in dofs]),
-        q_home=Q_HOME.copy(),
+        armature=np.array([joint.armature for joint in published]),
+        damping=np.array([joint.damping for joint in published]),
+        frictionloss=np.array([joint.frictionloss for joint in published]),
         frames=frames,
-        geoms=robot_geoms(),
+        geoms=geoms,
+        **limits,
     )
 
 
-# The camera looks along link6's z; its x (image right) is link6's -y, so that the image is upright at home.
-CAMERA_QUAT = (0.70710678, 0.0, 0.0, -0.70710678)
+def _joint_numbers(facts: Entry, published: list[PartJoint]) -> dict[str, Any]:
+    """Limits, gains and home position of all joints, from `joints` and, where that is silent, from the parts."""
+    numbers = {key: np.zeros(joints.NUM_JOINTS) for key in ("q_min", "q_max", "kp", "kv", "effort")}
+    numbers |= {key: np.zeros(joints.NUM_JOINTS) for key in ("qd_max", "qdd_max", "q_home")}
+    for group, part in joints.GROUPS.items():
+        entry, own = facts[group], published[part]
+        ranges = entry.get("range")
+        if ranges is not None and len(ranges.each()) != len(own):
+            raise ranges.error(f"must be {len(own)} times [low, high]")
+        limits = np.array([joint_range(r) for r in ranges.each()] if ranges else [joint.range for joint in own])
+        numbers["q_min"][part], numbers["q_max"][part] = limits.T
+        for key in ("kp", "kv", "effort"):
+            given = [getattr(joint, key) for joint in own]
+            numbers[key][part] = (
+                given if entry.get(key) is None and None not in given else _expand(entry[key], len(own))
+            )
+        for key, name in (("velocity", "qd_max"), ("acceleration", "qdd_max")):
+            numbers[name][part] = _expand(entry[key], len(own))
+        for name in ("kp", "kv", "effort", "qd_max", "qdd_max"):
+            if (numbers[name][part] <= 0).any():
+                raise entry.error("gains, effort, velocity and acceleration must be positive")
+        home = _expand(entry["home"], len(own))
+        for i, (low, high) in enumerate(limits):
+            if not low <= home[i] <= high:
+                raise entry["home"].error(f"{own[i].name} at {home[i]:g} is outside its range [{low:g}, {high:g}]")
+        numbers["q_home"][part] = home
+    return numbers
 
 
-def _base_inertial(facts: dict) -> Inertial:
-    """A solid box of the published mass over the body's published bounds."""
-    lo = np.array(facts["tidybot2_base"]["parts_aabb_m"]["body"]["min"])
-    hi = np.array(facts["tidybot2_base"]["parts_aabb_m"]["body"]["max"])
-    return _box_inertial(facts["tidybot2_base"]["mass"], (lo + hi) / 2, hi - lo)
+def _expand(entry: Entry, count: int) -> np.ndarray:
+    """Numbers [count] from one number for all joints, or a list."""
+    return entry.vector(count) if isinstance(entry.value, list) else np.full(count, entry.number())
 
 
-def _lidar_inertial(facts: dict) -> Inertial:
-    return _box_inertial(facts["unitree_l2"]["mass_kg"], np.zeros(3), np.array([0.075, 0.075, 0.065]))
+def _solid_box(entry: Entry) -> Inertial:
+    return _box_inertial(entry["mass"].number(above=0.0), entry["com"].vector(3), entry["box"].vector(3))
 
 
 def _box_inertial(mass: float, com: np.ndarray, size: np.ndarray) -> Inertial:
     s = size**2
     return Inertial(mass, com, np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) * mass / 12.0)
-
-
-def _with_camera(link: PartLink) -> PartLink:
-    """link6 carries the D435 in place of the gripper that its published inertia includes."""
-    if link.name != "link6":
-        return link
-    inertial = _box_inertial(CAMERA_MASS, np.array([0.0, 0.0, 0.02]), np.array([0.025, 0.09, 0.045]))
-    return PartLink(link.name, link.parent, link.pos, link.quat, inertial, link.joint, link.boxes)
 
 
 def forward_kinematics(robot: RobotModel, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,20 +1,22 @@
-"""The `assets` artifact: objects, scenes and instructions in one folder."""
+"""The `assets` artifact: objects, scenes, instructions and, where it is the user's own, the robot, in one folder."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from wbm.robot.model import RobotModel, load_robot
 from wbm.scenes.bank import SceneBank
 from wbm.scenes.instructions import Texts
 from wbm.scenes.objects import ObjectSet
 
 OBJECTS, SCENES, TEXTS, REPORT = "objects.npz", "scenes.npz", "instructions.npz", "report.json"
+ROBOT = "robot_facts.yaml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +27,13 @@ class Assets:
         objects: the object set.
         scenes: the bank of settled scenes.
         texts: instruction sentences and their embeddings.
+        robot: the robot that the scenes were made for.
     """
 
     objects: ObjectSet
     scenes: SceneBank
     texts: Texts
+    robot: RobotModel = field(default_factory=load_robot)
 
     @cached_property
     def meshes(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
@@ -37,10 +41,12 @@ class Assets:
         return {int(o): self.objects.mesh(int(o)) for o in np.flatnonzero(self.objects.has_mesh())}
 
     def save(self, folder: Path, report: dict[str, Any]) -> None:
-        """Write the arrays and the report into `folder`."""
+        """Write the arrays, the report and a user's robot into `folder`."""
         self.objects.save(folder / OBJECTS)
         self.scenes.save(folder / SCENES)
         self.texts.save(folder / TEXTS)
+        if self.robot.facts:
+            (folder / ROBOT).write_bytes(self.robot.facts)
         (folder / REPORT).write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
@@ -55,7 +61,9 @@ def load_assets(path: Path | str) -> Assets:
     missing = [name for name in (OBJECTS, SCENES, TEXTS) if not (folder / name).is_file()]
     if missing:
         raise FileNotFoundError(f"{folder} is not an assets artifact: lacks {', '.join(missing)}")
-    assets = Assets(ObjectSet.load(folder / OBJECTS), SceneBank.load(folder / SCENES), Texts.load(folder / TEXTS))
+    robot = load_robot(folder / ROBOT) if (folder / ROBOT).is_file() else load_robot()
+    objects, texts = ObjectSet.load(folder / OBJECTS), Texts.load(folder / TEXTS)
+    assets = Assets(objects, SceneBank.load(folder / SCENES), texts, robot)
     scenes, texts = assets.scenes, assets.texts
     if len(scenes) and scenes.object.max() >= len(assets.objects):
         raise ValueError(f"{folder}: scenes name object {scenes.object.max()}, the set has {len(assets.objects)}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 KINDS = ("table", "shelf", "bin")
 SOURCES = ("procedural", "meshes", "pybullet")
@@ -30,7 +30,7 @@ class ObjectsConfig:
     """
 
     source: str = "procedural"
-    path: str = ""
+    path: str = field(default="", metadata={"key": False})  # what lies there counts
     count: int = 240
     families: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ("carton", "prism")
@@ -44,7 +44,7 @@ class ObjectsConfig:
     coacd_threshold: float = 0.08
     max_file_mb: float = 64.0
     max_faces: int = 500_000
-    workers: int = 0
+    workers: int = field(default=0, metadata={"key": False})
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
@@ -70,7 +70,7 @@ class ScenesConfig:
     """How scenes are drawn.
 
     Attributes:
-        count: scenes of every kind (per split: `count` for train, `test_count` for test, a tenth of count for val).
+        count: scenes of every kind (per split: `count` for train, `test_count` for test, a fifth of count for val).
         test_count: scenes of every kind on test objects.
         kinds: `table`, `shelf`, `bin`.
         num_distractors: free bodies besides the target that the compiled model holds.
@@ -103,7 +103,7 @@ class ScenesConfig:
     grasp_reach: float = 0.65
     settle_time: float = 1.0
     settle_tolerance: float = 0.005
-    encoder: str = ""
+    encoder: str = field(default="", metadata={"key": False})  # one digest is accepted
 
     def __post_init__(self) -> None:
         unknown = [k for k in self.kinds if k not in KINDS]

@@ -37,7 +37,7 @@ class Imported:
 def cached_import(path: Path, cfg: ObjectsConfig) -> Imported | None:
     """The result for this file's content, if an earlier run kept it; a reason if the file cannot even be read."""
     try:
-        kept = load_arrays(_SECTION, _key(path, cfg))
+        kept = load_arrays(_SECTION, import_key(path, cfg))
     except OSError as error:
         return Imported([], f"cannot be read ({error.strerror})")
     if kept is None:
@@ -51,7 +51,7 @@ def keep_import(path: Path, cfg: ObjectsConfig, result: Imported) -> None:
     vertices = np.concatenate(result.hulls) if result.hulls else np.zeros((0, 3))
     starts = np.cumsum([0] + [len(h) for h in result.hulls])
     words = np.array([result.reason, result.rule])
-    store_arrays(_SECTION, _key(path, cfg), vertices=vertices, starts=starts, words=words)
+    store_arrays(_SECTION, import_key(path, cfg), vertices=vertices, starts=starts, words=words)
 
 
 def import_mesh(path: Path, cfg: ObjectsConfig) -> Imported:
@@ -65,7 +65,12 @@ def import_mesh(path: Path, cfg: ObjectsConfig) -> Imported:
         return Imported([], str(error))
 
 
-def _key(path: Path, cfg: ObjectsConfig) -> str:
+def import_key(path: Path, cfg: ObjectsConfig) -> str:
+    """Digest of a file's content and of the settings that decide what becomes of it.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
     settings = (VERSION, cfg.extent, cfg.max_hulls, cfg.max_hull_vertices, cfg.coacd_threshold, cfg.max_faces)
     digest = hashlib.blake2b(repr((settings, path.suffix.lower())).encode(), digest_size=16)
     if path.stat().st_size <= cfg.max_file_mb * 1e6:  # a larger one is refused by its size alone

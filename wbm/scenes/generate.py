@@ -9,7 +9,6 @@ import mjbatch
 import mujoco
 import numpy as np
 
-from wbm.robot.model import load_robot
 from wbm.scenes.bank import SceneBank, stack_scenes
 from wbm.scenes.cache import array_digest, code_digest, load_arrays, store_arrays
 from wbm.scenes.config import ScenesConfig
@@ -32,7 +31,7 @@ def wanted(cfg: ScenesConfig, objects: ObjectSet) -> dict[str, int]:
     """
     if not (objects.split == "train").any():
         raise ValueError(f"scenes: none of the {len(objects)} objects is for training; add objects or change the seed")
-    count = {"train": cfg.count, "val": max(1, cfg.count // 10), "test": cfg.test_count}
+    count = {"train": cfg.count, "val": max(1, cfg.count // 5), "test": cfg.test_count}
     return {s: count[s] for s in SPLITS if count[s] > 0 and (objects.split == s).any()}
 
 
@@ -48,7 +47,9 @@ def generate_scenes(model: SceneModel, cfg: ScenesConfig, seed: int, track: Trac
     objects = model.objects
     jobs = [(split, kind, n) for split, n in wanted(cfg, objects).items() for kind in cfg.kinds]
     jobs = [job for job in jobs if job[0] != "val" or (fits(job[1], objects) & (objects.split == "val")).any()]
-    content = array_digest(code_digest(), mujoco.__version__, *(getattr(objects, f.name) for f in fields(ObjectSet)))
+    options = replace(model.robot_options, facts="")  # what stands in that file counts, not where it lies
+    arrays = (getattr(objects, f.name) for f in fields(ObjectSet))
+    content = array_digest(code_digest(), mujoco.__version__, model.robot.facts, options, *arrays)
     banks = []
     for split, kind, count in track(jobs):
         key = array_digest(content, replace(cfg, count=1, test_count=0, encoder=""), seed, split, kind, count)
@@ -65,14 +66,13 @@ def generate_scenes(model: SceneModel, cfg: ScenesConfig, seed: int, track: Trac
 def _fill(model: SceneModel, kind: str, split: str, count: int, cfg: ScenesConfig, seed: int) -> SceneBank:
     """`count` settled scenes; round r draws from the generator (seed, kind, split, r) alone."""
     pool = np.flatnonzero(model.objects.split == split)
-    robot = load_robot()
     kept: list[SceneBank] = []
     have = 0
     for attempt in range(MAX_ROUNDS):
         rng = np.random.default_rng([seed, cfg.kinds.index(kind), SPLITS.index(split), attempt, 0x5CE])
         rows = []
         for _ in range(4 * (count - have) + 8):
-            row = draw_scene(kind, pool, split, model.objects, robot, cfg, rng)
+            row = draw_scene(kind, pool, split, model.objects, model.robot, cfg, rng)
             rows += [row] if row is not None else []
             if len(rows) >= int(1.15 * (count - have)) + 2:
                 break

@@ -16,7 +16,7 @@ import numpy as np
 
 from wbm.robot.facts import quat_to_mat
 from wbm.robot.mjcf import OBJECT_BIT, ROBOT_BIT, STATIC_BIT, MjcfOptions, add_contact_sensors, build_robot
-from wbm.robot.model import load_robot
+from wbm.robot.model import RobotModel, load_robot
 from wbm.scenes.bank import NUM_SUPPORTS, SceneBank
 from wbm.scenes.fields import body_tables, columns, write
 from wbm.scenes.objects import ObjectSet
@@ -69,12 +69,16 @@ class SceneModel:
     """
 
     def __init__(
-        self, objects: ObjectSet, cfg: SceneModelConfig | None = None, robot_options: MjcfOptions | None = None
+        self,
+        objects: ObjectSet,
+        cfg: SceneModelConfig | None = None,
+        robot_options: MjcfOptions | None = None,
+        robot: RobotModel | None = None,
     ) -> None:
         self.objects = objects
         self.cfg = cfg or SceneModelConfig()
-        self.robot = load_robot()
         self.robot_options = robot_options or MjcfOptions()
+        self.robot = robot or load_robot(self.robot_options.facts)
         self.bodies = ("target", *(f"distractor_{i}" for i in range(self.cfg.num_distractors)))
         self._mesh_of = _mesh_numbers(objects, self.cfg.slots)
         self.model = _compile_with_hulls(self._template())

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw
 
-from wbm.scenes.bank import SceneBank
+from wbm.scenes.assets import Assets
 from wbm.scenes.config import KINDS
 from wbm.scenes.model import SceneModel, SceneModelConfig
 from wbm.scenes.objects import ObjectSet
@@ -58,9 +58,10 @@ def object_sheet(objects: ObjectSet, path: Path, size: tuple[int, int] = (112, 1
     _write_sheet(tiles, columns, path)
 
 
-def scene_sheet(objects: ObjectSet, bank: SceneBank, path: Path, size: tuple[int, int] = (256, 192)) -> None:
+def scene_sheet(assets: Assets, path: Path, size: tuple[int, int] = (256, 192)) -> None:
     """One tile a scene, at most `MAX_SCENES` spread over the kinds, each with the robot at its start."""
-    model = SceneModel(objects, SceneModelConfig(num_distractors=bank.num_distractors))
+    objects, bank = assets.objects, assets.scenes
+    model = SceneModel(objects, SceneModelConfig(num_distractors=bank.num_distractors), robot=assets.robot)
     by_kind = [bank.where(kinds=(k,)) for k in range(len(KINDS))]
     by_kind = [index for index in by_kind if len(index)]
     each = MAX_SCENES // max(1, len(by_kind))

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from wbm.scenes.cache import array_digest
 from wbm.scenes.config import ObjectsConfig
-from wbm.scenes.decompose import Imported, cached_import, import_mesh, keep_import
+from wbm.scenes.decompose import Imported, cached_import, import_key, import_mesh, keep_import
 from wbm.scenes.families import Draft
 from wbm.scenes.isolate import run_isolated
 from wbm.scenes.meshfile import SUFFIXES
@@ -76,6 +77,24 @@ def find_meshes(root: Path, cfg: ObjectsConfig) -> list[Path]:
     if 0 < cfg.count < len(files):
         files = [files[i] for i in np.linspace(0, len(files) - 1, cfg.count).round().astype(int)]
     return files
+
+
+def sources_digest(cfg: ObjectsConfig) -> str:
+    """Digest of the names and contents of the mesh files that a run would read.
+
+    Raises:
+        FileNotFoundError: the folder or the package does not exist.
+        ValueError: there are no meshes.
+    """
+    root = mesh_folder(cfg)
+    keys = []
+    for path in find_meshes(root, cfg):
+        try:
+            content = import_key(path, cfg)
+        except OSError:  # such a file is skipped by name
+            content = ""
+        keys.append((path.relative_to(root).as_posix(), content))
+    return array_digest(*keys)
 
 
 def import_objects(
