@@ -172,7 +172,9 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
             for i, info in enumerate(reader.episodes):
                 target = draft.path / "mcap" / f"episode-{info.seed:04d}.mcap"
                 target.parent.mkdir(exist_ok=True)
-                write_episode_mcap(target, reader.read_episode(i), schema, scene_solids(assets, int(info.scene)))
+                episode = reader.read_episode(i)
+                solids = scene_solids(assets, int(info.scene), np.asarray(episode["p_obj_w"], dtype=np.float64))
+                write_episode_mcap(target, episode, schema, solids)
 
 
 def _curves(curve: Any, kind: str) -> dict[str, Any]:
