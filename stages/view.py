@@ -1,4 +1,4 @@
-"""`wbm view`: open a rollout, an evaluation's episodes, the scenes of assets, or the robot in the web viewer."""
+"""`wbm view`: rollouts, an evaluation's episodes, a live policy, the scenes of assets, or the robot in a browser."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 ROBOT = "robot"
 _EPISODE_FOLDERS = ("shards", "episodes")
+_POLICIES = ("student", "teacher", "bundle")
 _MAX_SHOWN = 200
 
 
@@ -23,14 +24,21 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         ArtifactError: no such artifact.
         ValueError: it holds nothing that can be looked at.
     """
+    from stages.commands import composer
     from stages.commands_artifacts import split
-    from wbm.report.viewer import Viewer
+    from wbm.report.viewer import Shown, Viewer
 
     store, names = split(items, count=1)
+    policy = None
     if names[0] == ROBOT:
         shown = robot_items()
+    elif (artifact := store.resolve(names[0])).manifest.kind in _POLICIES:
+        from stages.view_live import WatchedPolicy, start_policy
+
+        sys.stderr.write(f"{names[0]}: building its environment and sensors\n")
+        policy = start_policy(artifact, store, composer([item for item in items if "=" in item]))
+        shown = [Shown(artifact.manifest.ref, live=WatchedPolicy(policy))]
     else:
-        artifact = store.resolve(names[0])
         world = next(
             (store.resolve(r.ref) for r in artifact.manifest.inputs.values() if r.ref.startswith("assets/")), None
         )
@@ -44,6 +52,8 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         return
     finally:
         viewer.close()
+        if policy:
+            policy.close()
 
 
 def robot_items() -> list[Shown]:
@@ -104,7 +114,7 @@ def _episode_items(folder: Path, assets_path: Path | None) -> list[Shown]:
 
     def solids(episode: dict[str, Any]) -> tuple[Solid, ...]:
         target = np.asarray(episode["p_obj_w"], dtype=np.float64)
-        scene = str(episode["scene"])
+        scene = str(episode["scene"]).rpartition("/")[2]  # rollouts write the kind of support before the row
         if assets is None or not scene.isdigit() or int(scene) >= len(assets.scenes):
             return (target_marker(target),)
         return scene_solids(assets, int(scene), target)

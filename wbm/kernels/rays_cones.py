@@ -84,7 +84,7 @@ def is_out(
     cos_half: float,
     sin_half: float,
 ) -> bool:
-    """Whether an instance whose sphere meets a cone (`axis` and half angle, sensor frame) is clear of it all the same."""
+    """Whether an instance whose sphere meets a cone (axis and half angle, sensor frame) is clear of it all the same."""
     if kind != PLANE and is_beside(kind, wp.vec3(sphere[0], sphere[1], sphere[2]), size, rot, axis, cos_half, sin_half):
         return True
     if kind == BOX or kind == PLANE or kind == CYLINDER:
