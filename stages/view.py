@@ -1,4 +1,4 @@
-"""`wbm view`: open a rollout, an evaluation's episodes, the scenes of assets, or the robot in the web viewer."""
+"""`wbm view`: rollouts, an evaluation's episodes, a live policy, the scenes of assets, or the robot in a browser."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 ROBOT = "robot"
 _EPISODE_FOLDERS = ("shards", "episodes")
-_VIEWABLE = ("evaluation", "rollouts", "assets")  # what `wbm view reference` looks for, in this order
+_POLICIES = ("student", "teacher", "bundle")
+_VIEWABLE = ("evaluation", "student", "rollouts", "assets")  # what `wbm view reference` looks for, in this order
 _MAX_SHOWN = 200
 
 
@@ -31,20 +32,28 @@ def view(items: Sequence[str], port: int = 8080) -> None:
     """
     from stages.commands import composer
     from stages.commands_artifacts import split
-    from wbm.report.viewer import Viewer
+    from wbm.report.viewer import Shown, Viewer
     from wbm.robot.model import load_robot
     from wbm.scenes.assets import robot_of
 
     store, names = split(items, count=1)
+    policy = None
     if names[0] == ROBOT:
         robot = load_robot(composer([item for item in items if "=" in item]).robot.facts)
         shown = robot_items(robot)
     else:
         artifact = store.resolve(names[0], _VIEWABLE)
         world = _assets_of(artifact.manifest, store)
-        shown = items_of(artifact.path, artifact.manifest.kind, world.path if world else None)
         made_for = artifact if artifact.manifest.kind == "assets" else world
         robot = robot_of(made_for.path) if made_for else load_robot()
+        if artifact.manifest.kind in _POLICIES:
+            from stages.view_live import WatchedPolicy, start_policy
+
+            sys.stderr.write(f"{names[0]}: building its environment and sensors\n")
+            policy = start_policy(artifact, store, composer([item for item in items if "=" in item]))
+            shown = [Shown(artifact.manifest.ref, live=WatchedPolicy(policy))]
+        else:
+            shown = items_of(artifact.path, artifact.manifest.kind, world.path if world else None)
     viewer = Viewer(shown, port, robot)
     sys.stderr.write(f"{viewer.address} shows {names[0]} ({len(shown)} to choose from); Ctrl+C ends\n")
     try:
@@ -54,6 +63,8 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         return
     finally:
         viewer.close()
+        if policy:
+            policy.close()
 
 
 def _assets_of(manifest: Manifest, store: Store) -> Artifact | None:
@@ -126,7 +137,7 @@ def _episode_items(folder: Path, assets_path: Path | None) -> list[Shown]:
 
     def solids(episode: dict[str, Any]) -> tuple[Solid, ...]:
         target = np.asarray(episode["p_obj_w"], dtype=np.float64)
-        scene = str(episode["scene"])
+        scene = str(episode["scene"]).rpartition("/")[2]  # rollouts write the kind of support before the row
         if assets is None or not scene.isdigit() or int(scene) >= len(assets.scenes):
             return (target_marker(target),)
         return scene_solids(assets, int(scene), target)
