@@ -180,12 +180,16 @@ def doctor(overrides: Overrides = None, debug: Debug = False, as_json: Json = Fa
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="sensors, data, student or all.")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="wbc, sensors, data, student or all.")],
+    settings: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME=VALUE]...", help="Sizes of one suite: steps=1000000.", show_default=False),
+    ] = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """The project's own benchmarks beside the peers."""
-    _call("bench", "bench", suite, as_json)
+    _call("bench", "bench", suite, settings or [], as_json)
 
 
 @app.command()
