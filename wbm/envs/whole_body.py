@@ -33,9 +33,9 @@ class WholeBodyEnv(GraspEnv):
 
     In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed
     in the world (a target that followed the base would make the controller chase itself), and the posture is the
-    pre-grasp's, base included. Where obstacles block the straight way of the base, the base first follows the planner's corners with
-    the arm held as it is. A teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves
-    through both phases alike.
+    pre-grasp's, base included. Where obstacles block the straight way of the base, the base first follows the
+    planner's corners with the arm held as it is. A teacher's action counts from the moment the pre-grasp is reached.
+    `step_targets` moves through both phases alike.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
