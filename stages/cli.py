@@ -26,6 +26,8 @@ bundle_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made, and try it out."
 )
 app.add_typer(bundle_app, name="bundle")
+jobs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="What was submitted to the cluster.")
+app.add_typer(jobs_app, name="jobs")
 
 STAGES = {
     "prepare-assets": "Stage 1: objects, convex parts, settled scenes.",
@@ -178,12 +180,16 @@ def doctor(overrides: Overrides = None, debug: Debug = False, as_json: Json = Fa
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="sensors, data, student or all.")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="wbc, sensors, data, student or all.")],
+    settings: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME=VALUE]...", help="Sizes of one suite: steps=1000000.", show_default=False),
+    ] = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """The project's own benchmarks beside the peers."""
-    _call("bench", "bench", suite, as_json)
+    _call("bench", "bench", suite, settings or [], as_json)
 
 
 @app.command()
@@ -340,6 +346,33 @@ def bundle_compare(overrides: Overrides = None, debug: Debug = False, as_json: J
     _call("commands_bundle", "compare", overrides or [], as_json)
 
 
+Submission = Annotated[str, typer.Argument(metavar="SUBMISSION", help="Its id, or the beginning of it, or latest.")]
+
+
+@jobs_app.command("ls")
+def jobs_ls(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """List submissions and where their tasks are."""
+    _call("commands_jobs", "ls", overrides or [], as_json)
+
+
+@jobs_app.command("logs")
+def jobs_logs(
+    submission: Submission = "latest",
+    overrides: Overrides = None,
+    task: Annotated[str, typer.Option("--task", metavar="TASK", help="Only this one.")] = "",
+    lines: Annotated[int, typer.Option("-n", "--lines", help="Last lines of each log.")] = 20,
+    debug: Debug = False,
+) -> None:
+    """Show the logs of a submission."""
+    _call("commands_jobs", "logs", submission, overrides or [], task, lines)
+
+
+@jobs_app.command("cancel")
+def jobs_cancel(submission: Submission, overrides: Overrides = None, debug: Debug = False) -> None:
+    """Cancel all jobs of a submission."""
+    _call("commands_jobs", "cancel", submission, overrides or [])
+
+
 Remote = Annotated[str, typer.Argument(metavar="URL", help="s3://bucket/prefix or a directory.")]
 
 
@@ -378,19 +411,29 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code)
 
 
+_TOLD = (
+    "StageError", "Interrupted", "FactsError", "ArtifactError", "Missing", "Conflict", "LaunchError", "BundleError",
+    "Refused",
+)  # fmt: skip
+"""Errors whose text says what, where and what to do."""
+
+
 def _exit_code(error: BaseException) -> int:
     kind = type(error).__name__
     if hasattr(error, "exit_code") and hasattr(error, "format_message"):  # a usage error of Typer
-        return _complain(error.format_message(), 2)  # pyright: ignore[reportAttributeAccessIssue]
+        text: str = error.format_message().rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
+        path = getattr(getattr(error, "ctx", None), "command_path", "wbm")
+        return _complain(f"{text}; see `{path} --help`", 2)
     if kind == "Abort":
         return _complain("interrupted", 1)
     if kind == "ConfigError":
         return _complain(str(error), 2)
-    if kind in ("StageError", "FactsError", "Interrupted", "ArtifactError", "Missing", "Conflict"):
+    if kind in _TOLD:
         return _complain(str(error), 1)
     text = " ".join(str(error).split())
-    hint = "" if isinstance(error, OSError) else "; add --debug for the traceback"
-    return _complain(f"{kind}: {text}{hint}", 1)
+    if isinstance(error, OSError):
+        return _complain(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else text, 1)
+    return _complain(f"{text if kind == 'ValueError' else f'{kind}: {text}'}; add --debug for the traceback", 1)
 
 
 def _complain(message: str, code: int) -> int:

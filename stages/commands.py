@@ -89,7 +89,7 @@ def run_command(options: Options) -> None:
     if options.cfg:
         _print_config(options, composed)
     elif options.launcher == "slurm":
-        raise ConfigError("--launcher slurm is not available in this version: call wbm from an sbatch script")
+        _submit(options, composed)
     elif options.multirun:
         _sweep(options, composed)
     else:
@@ -128,10 +128,21 @@ def run_once(options: Options, overrides: Sequence[str]) -> list[Outcome]:
     store = open_store(composer(overrides))
     progress = Progress()
     if options.stage is None:
-        stages = registry.load_until(options.until) if options.until else registry.load_all()
-        nodes = planning.build(stages, overrides, composer, store, reference=options.source == WORD)
-        _announce(nodes, store, progress)
+        nodes = _pipeline(options, overrides, store, progress)
         return run_nodes(nodes, store, progress, force=options.force)
+    return [run_node(_single(options, overrides, store, progress), store, progress, force=options.force)]
+
+
+def _pipeline(options: Options, overrides: Sequence[str], store: Store, progress: Progress) -> list[planning.Node]:
+    stages = registry.load_until(options.until) if options.until else registry.load_all()
+    nodes = planning.build(stages, overrides, composer, store, reference=options.source == WORD)
+    _announce(nodes, store, progress)
+    return nodes
+
+
+def _single(options: Options, overrides: Sequence[str], store: Store, progress: Progress) -> planning.Node:
+    """The node of one stage, looked up with the newest inputs there are."""
+    assert options.stage is not None
     stages = registry.load_until(options.stage)
     nodes = planning.single(stages[-1], stages, overrides, composer, store, reference=options.source == WORD)
     _announce(nodes[-1:], store, progress)
@@ -145,7 +156,38 @@ def run_once(options: Options, overrides: Sequence[str]) -> list[Outcome]:
         if upstream.stale and store.latest(upstream.kind, upstream.name):
             reasons = because(upstream.reasons)
             progress.message(f"note: input {upstream.ref} is not up to date ({reasons}); using the newest")
-    return [run_node(nodes[-1], store, progress, force=options.force)]
+    return nodes[-1]
+
+
+def _submit(options: Options, composed: Sequence[Composed]) -> None:
+    """Submit every point to Slurm in one submission; a stage that has a suite runs all of it unless one is named."""
+    from stages import submit
+
+    progress, config = Progress(), composed[0].config
+    store = open_store(config)
+    runs = []
+    for item in composed:
+        if options.stage is None:
+            runs.append(planning.plan(_pipeline(options, item.overrides, store, progress), store))
+            continue
+        each = registry.load(options.stage).each
+        named = each is None or any(line.lstrip("+").split("=")[0] == each[0] for line in item.overrides)
+        entries = [()] if named or each is None else [(f"{each[0]}={e}",) for e in getattr(item.config, each[1])]
+        runs.append([_single(options, (*item.overrides, *extra), store, progress) for extra in entries])
+    made = submit.submit_nodes(runs, config.launcher, store, force=options.force)
+    if made and options.detach:
+        submit.say_detached(*made)
+        if options.as_json:
+            emit({"submission": made[0].id, "folder": str(made[1]), "tasks": [task.name for task in made[0].tasks]})
+        return
+    if made:
+        submit.say_detached(*made)
+        submit.wait(*made, config.launcher, progress)
+    done = submit.outcomes(runs, made, store)
+    if options.as_json:
+        emit(_document(done))
+    else:
+        sys.stdout.write(results_table(done))
 
 
 def _announce(nodes: Sequence[planning.Node], store: Store, progress: Progress) -> None:

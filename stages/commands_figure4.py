@@ -16,7 +16,7 @@ from stages import registry
 from stages.commands import composer, emit, open_store
 from stages.convert import ConfigError
 from stages.pipeline import StageError, run_node
-from stages.plan import Node, make_node
+from stages.plan import Node, bare_node
 from stages.progress import Progress
 from stages.reasons import because
 from stages.tables import seconds, table
@@ -62,7 +62,7 @@ def build(overrides: Sequence[str], store: Store) -> Sweep:
     if figure.reading in ("student", "both"):
         for arm in figure.arms:
             sweep.runs[f"student/{arm}"] = _student(sweep, arm, overrides, store)
-    node = make_node(registry.load("figure4"), composer(overrides), overrides)
+    node = bare_node(registry.load("figure4"), composer(overrides), overrides)
     node.upstream = dict(sweep.runs)
     sweep.nodes.append(node)
     return sweep
@@ -79,7 +79,7 @@ def _of_kind(sweep: Sweep, kind: str) -> Node:
 def _rl_run(sweep: Sweep, arm: str, seed: int, overrides: Sequence[str]) -> Node:
     """The node of an RL run, added unless it is there."""
     lines = [*overrides, f"env={arm}", f"figure4.arm={arm}", f"figure4.seed={seed}"]
-    node = make_node(registry.load("figure4-run"), composer(lines), lines)
+    node = bare_node(registry.load("figure4-run"), composer(lines), lines)
     known = _find(sweep, node.ref)
     if known:
         return known
@@ -108,11 +108,11 @@ def _student(sweep: Sweep, arm: str, overrides: Sequence[str], store: Store) -> 
         made_by = [policy]
     else:
         made_by, rolled = [node for node in sweep.nodes if node.stage.name == "train-teacher"], lines
-    rollouts = make_node(registry.load("generate-rollouts"), composer(rolled), rolled, arm)
+    rollouts = bare_node(registry.load("generate-rollouts"), composer(rolled), rolled, name=arm)
     rollouts.upstream = {"assets": assets, **{node.ref: node for node in made_by}}
-    student = make_node(registry.load("distill"), composer(lines), lines, arm)
+    student = bare_node(registry.load("distill"), composer(lines), lines, name=arm)
     student.upstream = {"rollouts": rollouts}
-    evaluation = make_node(registry.load("evaluate"), composer(lines), lines, arm)
+    evaluation = bare_node(registry.load("evaluate"), composer(lines), lines, name=arm)
     evaluation.upstream = {"assets": assets, "policy": student}
     sweep.nodes += [rollouts, student, evaluation]
     return evaluation

@@ -13,6 +13,7 @@ from wbm.control.config import WbcConfig
 from wbm.deploy.config import DeployConfig
 from wbm.envs.config import EnvConfig
 from wbm.envs.rollout_config import RolloutsConfig
+from wbm.launch.config import LauncherConfig
 from wbm.learning.config import PpoConfig, TeacherConfig
 from wbm.learning.figure4_config import Figure4Config
 from wbm.learning.student_config import DistillConfig, StudentConfig
@@ -43,6 +44,7 @@ class Config:
     inputs: dict[str, str] = field(default_factory=dict)
     teachers: tuple[str, ...] = ("top_down", "side")
     artifacts: ArtifactsConfig = field(default_factory=ArtifactsConfig)
+    launcher: LauncherConfig = field(default_factory=LauncherConfig)
     robot: MjcfOptions = field(default_factory=MjcfOptions)
     wbc: WbcConfig = field(default_factory=WbcConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)

@@ -52,6 +52,11 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     draft.metrics |= summary
 
 
+def uses_gpu(cfg: Any) -> bool:
+    """The physics engine decides."""
+    return cfg.sim.engine == "mujoco_warp"
+
+
 def _check_kind(policy: Any) -> None:
     from wbm.learning.evaluation import POLICY_KINDS
 
@@ -68,6 +73,9 @@ def _refusals(records: list[dict[str, Any]]) -> dict[str, int]:
 
 def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[dict[str, Any]]:
     """Play what is missing; a finished block is a file in the scratch folder, from which an interrupted run goes on."""
+    import shutil
+
+    from wbm.artifacts.files import fsync_tree, write_atomic
     from wbm.envs.world import WorldConfig
     from wbm.learning.evaluation import BlockJob
     from wbm.learning.workers import run_jobs
@@ -90,12 +98,16 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
         for first in range(0, e.episodes, BLOCK)
     ]  # fmt: skip
     waiting = [job for job in jobs if not _block(blocks, job.first).is_file()]
+    if any(job.first < e.record_episodes for job in waiting):
+        shutil.rmtree(blocks / "episodes", ignore_errors=True)  # of a block that did not finish
     with progress.task("episodes", total=e.episodes) as task:
         task.update(e.episodes - sum(job.count for job in waiting))
         for result in run_jobs("wbm.learning.evaluation", waiting, e.workers):
-            _write(_block(blocks, result.first), result.records)
+            fsync_tree(blocks)  # its trajectories and episodes, before the file that says that they are there
+            write_atomic(_block(blocks, result.first), _json(result.records))
             won = sum(r["success"] for r in result.records)
             task.update(len(result.records), success=won / len(result.records))
+            progress.safe_point()
     return [r for job in jobs for r in json.loads(_block(blocks, job.first).read_text())]
 
 
@@ -190,6 +202,8 @@ def _plain(settings: Any) -> dict[str, Any]:
 
 
 def _write(path: Path, value: Any) -> None:
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    partial.replace(path)
+    path.write_bytes(_json(value))
+
+
+def _json(value: Any) -> bytes:
+    return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()

@@ -209,16 +209,6 @@ def _needed(nodes: list[Node], targets: Sequence[Node]) -> list[Node]:
     return [node for node in nodes if id(node) in wanted]
 
 
-def make_node(stage: Stage, config: Config, overrides: Sequence[str] = (), name: str | None = None) -> Node:
-    """A stage under a configuration, without inputs yet; `name` in place of the stage's own name for its artifact."""
-    sections = {name: plain(getattr(config, name), key_only=True) for name in stage.sections}
-    view = SectionView(config, stage)
-    if outside := stage.outside(view):
-        sections["outside"] = outside
-    name = name or stage.artifact_name(view)
-    return Node(stage, config, tuple(overrides), stage.kind, name, _code(stage.module), sections)
-
-
 def _node(
     stage: Stage,
     config: Config,
@@ -231,7 +221,7 @@ def _node(
 
     `stand_in` lists the kinds of inputs that are taken from the reference results where they have one.
     """
-    node = make_node(stage, config, overrides)
+    node = bare_node(stage, config, overrides)
     asked = {slot.name: _asked(slot, config) for slot in stage.slots}
     if any(text and is_reference(text) for text in asked.values()):
         stand_in = KINDS  # the results belong together: a reference policy is judged on the reference scenes
@@ -256,6 +246,22 @@ def _node(
                 f"{stage.name}: no stage makes its input '{slot.name}'; set +inputs.{slot.name}=KIND/NAME"
             )
     return node
+
+
+def bare_node(
+    stage: Stage,
+    config: Config,
+    overrides: Sequence[str] = (),
+    code: Code | None = None,
+    name: str | None = None,
+) -> Node:
+    """A node without its inputs; `name` in place of the stage's own name for its artifact."""
+    sections = {name: plain(getattr(config, name), key_only=True) for name in stage.sections}
+    view = SectionView(config, stage)
+    if outside := stage.outside(view):
+        sections["outside"] = outside
+    name = name or stage.artifact_name(view)
+    return Node(stage, config, tuple(overrides), stage.kind, name, code or _code(stage.module), sections)
 
 
 def _asked(slot: Slot, config: Config) -> str | None:

@@ -3,7 +3,6 @@
 import json
 import os
 import random
-import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -198,36 +197,6 @@ def test_completion_offers_commands_options_groups_keys_and_values():
     assert complete("run", "env.end_on_collision=") == ["env.end_on_collision=false", "env.end_on_collision=true"]
     assert complete("artifacts", "ve") == ["verify"]
     assert complete("completion", "f") == ["fish"]
-
-
-def shell_answers(shell, script):
-    if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
-    return subprocess.run([shell, "-c", script], env=ENV, capture_output=True, text=True, timeout=60).stdout.split()
-
-
-def test_bash_completes_after_an_equals_sign(tmp_path):
-    """Bash takes `=` for the end of a word: the reply must not repeat what stands before it."""
-    program = tmp_path / "wbm"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m stages.cli "$@"\n')
-    program.chmod(0o755)
-    script = f"PATH={tmp_path}:$PATH\n{completion.SCRIPTS['bash']}\n"
-    line = "wbm run profile=la"
-    script += f"COMP_LINE='{line}' COMP_POINT={len(line)} COMP_WORDS=(wbm run profile = la) COMP_CWORD=4\n_wbm\n"
-    assert shell_answers("bash", script + 'echo "${COMPREPLY[@]}"') == ["laptop"]
-    script = script.replace(f"COMP_LINE='{line}'", "COMP_LINE='wbm dist'").replace(
-        f"COMP_POINT={len(line)}", "COMP_POINT=8"
-    )
-    script = script.replace("COMP_WORDS=(wbm run profile = la) COMP_CWORD=4", "COMP_WORDS=(wbm dist) COMP_CWORD=1")
-    assert shell_answers("bash", script + 'echo "${COMPREPLY[@]}"') == ["distill"]
-
-
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_other_shells_accept_the_script(shell, tmp_path):
-    path = tmp_path / "script"
-    path.write_text(completion.SCRIPTS[shell])
-    shell_answers(shell, "true")
-    assert subprocess.run([shell, "-n", path]).returncode == 0
 
 
 @pytest.fixture

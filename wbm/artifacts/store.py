@@ -16,7 +16,7 @@ from wbm.artifacts.backend import ABSENT, Backend, LocalBackend
 from wbm.artifacts.digest import KEY_LENGTH
 from wbm.artifacts.errors import ArtifactError, Conflict, Missing
 from wbm.artifacts.files import fsync_path, make_dirs, remove_tree
-from wbm.artifacts.lease import Lease, acquire, is_live
+from wbm.artifacts.lease import Lease, acquire, is_held, is_live
 from wbm.artifacts.manifest import MANIFEST, NAME, Artifact, Manifest, check_files, parse_manifest, seal
 from wbm.artifacts.reference import References, is_reference
 
@@ -80,6 +80,11 @@ class Draft:
         shutil.rmtree(self.scratch, ignore_errors=True)
         self.lease.release()
         return target
+
+
+def scratch_of(staging: Path) -> Path:
+    """The folder for checkpoints that belongs to a staging folder."""
+    return staging.with_name(staging.name + ".scratch")
 
 
 class Store:
@@ -179,12 +184,22 @@ class Store:
                 continue
         raise Conflict(f"{path}: other processes keep changing it; try again")
 
-    def begin(self, manifest: Manifest, *, force: bool = False, wait_s: float = 0.0) -> Draft:
+    def staging(self, ref: str) -> Path:
+        """Where an artifact is written before it is published."""
+        return self.backend.work / ".staging" / ref
+
+    def forget(self, ref: str) -> None:
+        """Delete what an interrupted attempt left."""
+        shutil.rmtree(self.staging(ref), ignore_errors=True)
+        shutil.rmtree(scratch_of(self.staging(ref)), ignore_errors=True)
+
+    def begin(self, manifest: Manifest, *, force: bool = False, resume: bool = False, wait_s: float = 0.0) -> Draft:
         """Start, or resume, the artifact with `manifest.key`.
 
         Args:
             manifest: kind, name, key and what else is known before the stage runs.
             force: forget an interrupted attempt and replace an artifact with this key.
+            resume: continue an interrupted attempt even so.
             wait_s: how long to wait for another process that writes the same artifact.
 
         Raises:
@@ -195,8 +210,8 @@ class Store:
             raise ArtifactError(
                 f"{manifest.kind}/{manifest.name}: names hold letters, digits, dot, dash and underscore"
             )
-        staging = self.backend.work / ".staging" / manifest.ref
-        scratch = staging.with_name(staging.name + ".scratch")
+        staging = self.staging(manifest.ref)
+        scratch = scratch_of(staging)
         try:
             lease = acquire(self.backend, f"leases/{manifest.ref}", wait_s=wait_s)
         except OSError as error:
@@ -206,9 +221,8 @@ class Store:
         try:
             if self.backend.has(manifest.ref) and not force:
                 raise Conflict(f"{manifest.ref}: already published")
-            if force:
-                shutil.rmtree(staging, ignore_errors=True)
-                shutil.rmtree(scratch, ignore_errors=True)
+            if force and not resume:
+                self.forget(manifest.ref)
             make_dirs(staging)
             (staging / MANIFEST).unlink(missing_ok=True)
             make_dirs(scratch)
@@ -304,7 +318,7 @@ class Store:
             for path in sorted((self.backend.work / area).glob("*/*/*")):
                 ref = path.relative_to(self.backend.work / area).as_posix().removesuffix(".scratch")
                 idle = time.time() - max(path.stat().st_mtime, path.stat().st_ctime)
-                if idle >= grace_s and not (area == ".staging" and is_live(self.backend, f"leases/{ref}")):
+                if idle >= grace_s and not (area == ".staging" and is_held(self.backend, ref)):
                     found.append(path)
         return found
 
