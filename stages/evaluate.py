@@ -195,9 +195,10 @@ def _block(folder: Path, first: int) -> Path:
 
 
 def _plain(settings: Any) -> dict[str, Any]:
-    from dataclasses import asdict
+    """Settings that a result depends on; the number of processes is none."""
+    from wbm.artifacts.digest import plain
 
-    return asdict(settings)
+    return plain(settings, key_only=True)
 
 
 def _write(path: Path, value: Any) -> None:
