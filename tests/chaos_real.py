@@ -29,19 +29,20 @@ from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(REPOSITORY))
-SMALL = """
-    profile=smoke sim.threads=1 distill.threads=1 sensors=exact teachers=[top_down] objects.count=6 objects.workers=1 scenes.count=4 scenes.test_count=1
-    scenes.kinds=[table] scenes.settle_time=0.2 scenes.settle_tolerance=1.0
-    env.episode_s=0.4 env.approach_s=0.2 env.success_hold_s=0.1
-    teacher.iterations=4 teacher.eval_every=2 teacher.num_envs=4 teacher.eval_envs=2 teacher.eval_episodes=2
-    ppo.steps=4 ppo.epochs=1 ppo.minibatches=1
-    rollouts.shards=3 rollouts.episodes=2 rollouts.num_envs=2 rollouts.samples=1 rollouts.workers=1
-    sensors.depth.width=16 sensors.depth.height=12 sensors.lidar.num_rays=64
-    sensors.depth_cloud.num_points=32 sensors.lidar_cloud.num_points=32
-    distill.iterations=8 distill.batch_size=4 distill.warmup=1 distill.val_every=4 distill.checkpoint_every=2
-    evaluation.episodes=34 evaluation.num_envs=17 evaluation.workers=1 evaluation.videos=1 evaluation.filmstrips=0
-    evaluation.record_episodes=1 evaluation.video_width=64 evaluation.video_height=48
-""".split()
+SMALL = [
+    "profile=smoke", "sim.threads=1", "distill.threads=1", "sensors=exact", "teachers=[top_down]", "objects.count=6",
+    "objects.workers=1", "scenes.count=4", "scenes.test_count=1", "scenes.kinds=[table]", "scenes.settle_time=0.2",
+    "scenes.settle_tolerance=1.0", "env.episode_s=0.4", "env.approach_s=0.2", "env.success_hold_s=0.1",
+    "teacher.iterations=4", "teacher.eval_every=2", "teacher.num_envs=4", "teacher.eval_envs=2",
+    "teacher.eval_episodes=2", "ppo.steps=4", "ppo.epochs=1", "ppo.minibatches=1", "rollouts.shards=3",
+    "rollouts.episodes=2", "rollouts.num_envs=2", "rollouts.samples=1", "rollouts.workers=1",
+    "sensors.depth.width=16", "sensors.depth.height=12", "sensors.lidar.num_rays=64",
+    "sensors.depth_cloud.num_points=32", "sensors.lidar_cloud.num_points=32", "distill.iterations=8",
+    "distill.batch_size=4", "distill.warmup=1", "distill.val_every=4", "distill.checkpoint_every=2",
+    "evaluation.episodes=34", "evaluation.num_envs=17", "evaluation.workers=1", "evaluation.videos=1",
+    "evaluation.filmstrips=0", "evaluation.record_episodes=1", "evaluation.video_width=64",
+    "evaluation.video_height=48",
+]  # fmt: skip
 
 
 SPANS_S = (0.2, 0.6, 0.6, 1.2, 4.5)  # a run is killed between 0 and one of these: starts, short units, long ones
@@ -61,7 +62,7 @@ class Damage:
 
 
 class Disk:
-    """A directory that can lose what was not flushed: an ext4 image in memory, mounted; plain where that is not allowed."""
+    """A directory that can lose what was not flushed: an ext4 image; a plain one where mounting is not allowed."""
 
     def __init__(self, folder: Path, size_mb: int = 96) -> None:
         self.root, self.image, self.number = folder / "disk", folder / "image-0", 0
