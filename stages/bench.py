@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from stages.commands import emit
+from stages.commands import composer, emit
 from stages.convert import ConfigError, nearest
 from stages.progress import Progress
 from stages.tables import table
@@ -21,12 +21,13 @@ SUITES = {
 }
 
 
-def bench(suite: str, as_json: bool) -> None:
+def bench(suite: str, overrides: Sequence[str], as_json: bool) -> None:
     """Run one suite, or `all`, and print its figures.
 
     Raises:
-        ConfigError: no such suite.
+        ConfigError: no such suite, or a wrong setting; the suites fix their own.
     """
+    composer(overrides)
     if suite != "all" and suite not in SUITES:
         raise ConfigError(f"bench {suite}: no such suite{nearest(suite, [*SUITES, 'all'])}")
     results: dict[str, Any] = {}
