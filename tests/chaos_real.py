@@ -275,13 +275,14 @@ def storm(folder: Path, kills: int, seeds: int = 1, seed: int = 0, minutes: floa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--seeds", type=int, default=2, help="different pipelines, each run undisturbed first")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     began = time.monotonic()
     base = "/dev/shm" if Path("/dev/shm").is_dir() else None
     with tempfile.TemporaryDirectory(dir=base) as folder:
-        damage = storm(Path(folder), options.kills, 2, options.seed, options.minutes)
+        damage = storm(Path(folder), options.kills, options.seeds, options.seed, options.minutes)
     redone = {count: damage.redone.count(count) for count in sorted(set(damage.redone))}
     print(f"{damage.kills} kills, {damage.cuts} of them with the power cut, {time.monotonic() - began:.0f} s")
     print(f"{damage.pipelines} pipelines, {damage.units} units of work finished, last finished unit: {damage.where}")
