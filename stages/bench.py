@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from stages.commands import emit
+from stages.commands import composer, emit
 from stages.convert import ConfigError, nearest
 from stages.progress import Progress
 from stages.tables import table
@@ -28,40 +28,43 @@ def bench(suite: str, settings: Sequence[str], as_json: bool) -> None:
 
     Args:
         suite: name of a suite, or `all`.
-        settings: NAME=VALUE for whole numbers and switches of a single suite, such as `steps=1000000`.
+        settings: NAME=VALUE for whole numbers and switches of a single suite, such as `steps=1000000`. What else stands
+            there is checked against the configuration; the suites fix their own.
         as_json: one JSON document in place of a table.
 
     Raises:
-        ConfigError: no such suite, or a setting that it does not have.
+        ConfigError: no such suite, or a setting that neither it nor the configuration has.
     """
     if suite != "all" and suite not in SUITES:
         raise ConfigError(f"bench {suite}: no such suite{nearest(suite, [*SUITES, 'all'])}")
-    if suite == "all" and settings:
-        raise ConfigError(f"bench all: {settings[0]} belongs to one suite; name that suite")
+    names = {} if suite == "all" else _known(_function(suite))
+    own = [s for s in settings if s.partition("=")[0] in names and s.partition("=")[0] != "seed"]
+    composer([s for s in settings if s not in own])
     results: dict[str, Any] = {}
     with Progress() as progress:
         for name in progress.track(list(SUITES) if suite == "all" else [suite], "bench"):
-            module, _, function = SUITES[name].partition(":")
-            run = getattr(importlib.import_module(module), function)
-            results[name] = run(**_arguments(suite, run, settings))
+            results[name] = _function(name)(**_arguments(suite, names, own))
     if as_json:
         emit(results if suite == "all" else results[suite])
     else:
         sys.stdout.write(table(["figure", "value"], [[k, _text(v)] for k, v in _leaves(results)]))
 
 
-def _arguments(suite: str, function: Any, settings: Sequence[str]) -> dict[str, Any]:
-    """The settings as arguments of the suite's function: those whose default is a whole number or a switch."""
-    known = {
-        name: type(p.default)
-        for name, p in inspect.signature(function).parameters.items()
-        if type(p.default) in (int, bool)
-    }
+def _function(suite: str) -> Callable[..., Mapping[str, Any]]:
+    module, _, function = SUITES[suite].partition(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def _known(function: Callable[..., Any]) -> dict[str, type]:
+    """The function's settings by name: those whose default is a whole number or a switch."""
+    parameters = inspect.signature(function).parameters
+    return {name: type(p.default) for name, p in parameters.items() if type(p.default) in (int, bool)}
+
+
+def _arguments(suite: str, known: Mapping[str, type], settings: Sequence[str]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for setting in settings:
         name, _, value = setting.partition("=")
-        if name not in known:
-            raise ConfigError(f"bench {suite}: no setting {name!r}{nearest(name, list(known))}")
         try:
             out[name] = {"true": True, "false": False}[value] if known[name] is bool else int(value)
         except (KeyError, ValueError):

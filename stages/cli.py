@@ -127,16 +127,17 @@ def _add_evaluate(text: str) -> None:
         launcher: Launcher = "local",
         detach: Detach = False,
         force: Force = False,
+        source: Source = None,
         debug: Debug = False,
         as_json: Json = False,
     ) -> None:
         if figure4:
-            if cfg or info or multirun or detach or launcher != "local":
+            if cfg or info or multirun or detach or source or launcher != "local":
                 raise typer.BadParameter("--figure4 goes with --force, --debug and --json alone")
             _call("commands_figure4", "figure4_command", overrides or [], force, as_json)
             return
         _run("evaluate", overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach,
-             force=force, as_json=as_json)  # fmt: skip
+             force=force, source=source, as_json=as_json)  # fmt: skip
 
     command.__doc__ = text
     app.command("evaluate")(command)
@@ -180,7 +181,7 @@ def doctor(overrides: Overrides = None, debug: Debug = False, as_json: Json = Fa
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="wbc, sensors, data, student or all.")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="wbc, sensors, env, data, student or all.")],
     settings: Annotated[
         list[str] | None,
         typer.Argument(metavar="[NAME=VALUE]...", help="Sizes of one suite: steps=1000000.", show_default=False),
@@ -296,9 +297,9 @@ def robot_export(path: FilePath, overrides: Overrides = None, debug: Debug = Fal
 
 
 @robot_app.command("facts")
-def robot_facts(debug: Debug = False) -> None:
+def robot_facts(overrides: Overrides = None, debug: Debug = False) -> None:
     """Print the facts that robot.facts=FILE is laid over."""
-    _call("commands_robot", "robot_facts")
+    _call("commands_robot", "robot_facts", overrides or [])
 
 
 BundlePath = Annotated[str, typer.Argument(metavar="BUNDLE", help="A file, its folder, or bundle/NAME in the store.")]

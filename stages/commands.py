@@ -109,7 +109,7 @@ def _known_stage(name: str | None) -> None:
 
 def _known_source(name: str | None) -> None:
     if name not in (None, WORD):
-        raise ConfigError(f"--from {name}: only '{WORD}' is known; name other artifacts with +inputs.SLOT=KIND/NAME")
+        raise ConfigError(f"--from {name}: only '{WORD}' is known; name other artifacts with inputs.SLOT=KIND/NAME")
 
 
 def _print_config(options: Options, composed: Sequence[Composed]) -> None:

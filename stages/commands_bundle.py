@@ -11,6 +11,7 @@ from typer import Exit
 
 from stages.commands import Options, composer, emit, open_store, run_once
 from stages.convert import ConfigError
+from wbm.artifacts.reference import is_reference
 
 if TYPE_CHECKING:
     from wbm.deploy.bundle import Bundle
@@ -91,8 +92,8 @@ def _open(path: str, overrides: Sequence[str]) -> Bundle:
     from wbm.deploy.bundle import Bundle
 
     place = Path(path)
-    if not place.exists() and path.startswith(("bundle/", "reference/")):
-        place = open_store(composer(overrides)).resolve(path).path
+    if not place.exists() and (path.startswith("bundle/") or is_reference(path)):
+        place = open_store(composer(overrides)).resolve(path, ("bundle",)).path
     if not place.exists():
         raise ConfigError(f"{path}: no such file; name a bundle's file, its folder, or bundle/NAME in the store")
     return Bundle.open(place / "policy.wbm" if place.is_dir() else place)

@@ -38,8 +38,9 @@ def robot_export(path: str, overrides: Sequence[str]) -> None:
     sys.stderr.write(f"{path}: written; open it with `python -m mujoco.viewer --mjcf={path}`\n")
 
 
-def robot_facts() -> None:
+def robot_facts(overrides: Sequence[str]) -> None:
     """Print the standard facts: what `robot.facts` is laid over."""
+    composer(overrides)  # no setting matters here, a wrong one is an error all the same
     from wbm.robot.facts import standard_text
 
     sys.stdout.write(standard_text())

@@ -153,7 +153,7 @@ def _check_slots(config: Config) -> None:
         known |= {f"{slot.kind}_{entry}" for entry in suites.get(slot.kind, ())} if slot.every else {slot.name}
     for name in config.inputs:
         if name not in known:
-            raise ConfigError(f"+inputs.{name}: no stage has this input{nearest(name, sorted(known))}")
+            raise ConfigError(f"inputs.{name}: no stage has this input{nearest(name, sorted(known))}")
 
 
 def _variants(
@@ -242,9 +242,7 @@ def _node(
             else:
                 node.upstream[name] = other
         if not matches:
-            raise ConfigError(
-                f"{stage.name}: no stage makes its input '{slot.name}'; set +inputs.{slot.name}=KIND/NAME"
-            )
+            raise ConfigError(f"{stage.name}: no stage makes its input '{slot.name}'; set inputs.{slot.name}=KIND/NAME")
     return node
 
 

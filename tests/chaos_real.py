@@ -22,29 +22,30 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(REPOSITORY))
-SMALL = """
-    profile=smoke sim.threads=1 distill.threads=1 sensors=exact teachers=[top_down] objects.count=6 objects.workers=1 scenes.count=4 scenes.test_count=1
-    scenes.kinds=[table] scenes.settle_time=0.2 scenes.settle_tolerance=1.0
-    env.episode_s=0.4 env.approach_s=0.2 env.success_hold_s=0.1
-    teacher.iterations=4 teacher.eval_every=2 teacher.num_envs=4 teacher.eval_envs=2 teacher.eval_episodes=2
-    ppo.steps=4 ppo.epochs=1 ppo.minibatches=1
-    rollouts.shards=3 rollouts.episodes=2 rollouts.num_envs=2 rollouts.samples=1 rollouts.workers=1
-    sensors.depth.width=16 sensors.depth.height=12 sensors.lidar.num_rays=64
-    sensors.depth_cloud.num_points=32 sensors.lidar_cloud.num_points=32
-    distill.iterations=8 distill.batch_size=4 distill.warmup=1 distill.val_every=4 distill.checkpoint_every=2
-    evaluation.episodes=34 evaluation.num_envs=17 evaluation.workers=1 evaluation.videos=1 evaluation.filmstrips=0
-    evaluation.record_episodes=1 evaluation.video_width=64 evaluation.video_height=48
-""".split()
+SMALL = [
+    "profile=smoke", "sim.threads=1", "distill.threads=1", "sensors=exact", "teachers=[top_down]", "objects.count=6",
+    "objects.workers=1", "scenes.count=4", "scenes.test_count=1", "scenes.kinds=[table]", "scenes.settle_time=0.2",
+    "scenes.settle_tolerance=1.0", "env.episode_s=0.4", "env.approach_s=0.2", "env.success_hold_s=0.1",
+    "teacher.iterations=4", "teacher.eval_every=2", "teacher.num_envs=4", "teacher.eval_envs=2",
+    "teacher.eval_episodes=2", "ppo.steps=4", "ppo.epochs=1", "ppo.minibatches=1", "rollouts.shards=3",
+    "rollouts.episodes=2", "rollouts.num_envs=2", "rollouts.samples=1", "rollouts.workers=1",
+    "sensors.depth.width=16", "sensors.depth.height=12", "sensors.lidar.num_rays=64",
+    "sensors.depth_cloud.num_points=32", "sensors.lidar_cloud.num_points=32", "distill.iterations=8",
+    "distill.batch_size=4", "distill.warmup=1", "distill.val_every=4", "distill.checkpoint_every=2",
+    "evaluation.episodes=34", "evaluation.num_envs=17", "evaluation.workers=1", "evaluation.videos=1",
+    "evaluation.filmstrips=0", "evaluation.record_episodes=1", "evaluation.video_width=64",
+    "evaluation.video_height=48",
+]  # fmt: skip
 
 
-SPANS_S = (0.2, 0.6, 0.6, 1.2, 4.5)  # a run is killed between 0 and one of these: starts, short units, long ones
+SPANS_S = (0.2, 0.6, 0.6, 1.2, 1.2, 8.0)  # a run is killed between 0 and one of these: starts, short units, long ones
 
 
 @dataclass
@@ -61,7 +62,7 @@ class Damage:
 
 
 class Disk:
-    """A directory that can lose what was not flushed: an ext4 image in memory, mounted; plain where that is not allowed."""
+    """A directory that can lose what was not flushed: an ext4 image; a plain one where mounting is not allowed."""
 
     def __init__(self, folder: Path, size_mb: int = 96) -> None:
         self.root, self.image, self.number = folder / "disk", folder / "image-0", 0
@@ -179,28 +180,24 @@ def watch_units(log: Path) -> None:
     wrap(Draft, "publish", lambda draft: f"publish {draft.manifest.kind}", before=True)
 
 
-def own_time(pid: int) -> float:
-    """Seconds that a process and its children spent on a core or waiting for a disk, but not waiting for a core."""
-    waited = 0.0
-    for path in (Path(f"/proc/{pid}"), *_children(pid)):
-        with contextlib.suppress(OSError, IndexError):
-            waited += int((path / "schedstat").read_text().split()[1]) / 1e9
-    return -waited
-
-
-def _children(pid: int) -> Iterator[Path]:
-    with contextlib.suppress(OSError):
-        yield from (Path(f"/proc/{p}") for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
+def cpu_time(pid: int) -> float:
+    """Processor seconds of a process and its children: how far it is, however busy the machine is."""
+    total = 0
+    with contextlib.suppress(OSError, IndexError):
+        workers = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        for number in (pid, *workers):
+            fields = Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()
+            total += int(fields[11]) + int(fields[12])
+    return total / os.sysconf("SC_CLK_TCK")
 
 
 def strike(pid: int, after_s: float, whole_group: bool) -> int | None:
-    """Wait for the end of a process, or kill it after `after_s` of its own time; the exit code, None if killed."""
-    began = time.monotonic()
+    """Wait for the end of a process, or kill it after `after_s` of processor time; the exit code, None if killed."""
     while True:
         done, status = os.waitpid(pid, os.WNOHANG)
         if done:
             return os.waitstatus_to_exitcode(status)
-        if time.monotonic() - began + own_time(pid) >= after_s:
+        if cpu_time(pid) >= after_s:
             (os.killpg if whole_group else os.kill)(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
             _wait_for_orphans(pid)
@@ -257,6 +254,8 @@ def storm(folder: Path, kills: int, seeds: int = 1, seed: int = 0, minutes: floa
                         damage.cuts += 1
                 problems = Store.open(root).verify()
                 damage.problems += [f"pipeline {damage.pipelines}, kill {damage.kills}: {p}" for p in problems]
+                if len(again) > 1:
+                    damage.problems.append(f"kill {damage.kills}: {len(again)} finished units done again: {again}")
             if code:
                 damage.problems.append(errors.read_text()[-500:])
                 shutil.copy(errors, folder / f"errors-{damage.pipelines}")
@@ -276,13 +275,14 @@ def storm(folder: Path, kills: int, seeds: int = 1, seed: int = 0, minutes: floa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--seeds", type=int, default=2, help="different pipelines, each run undisturbed first")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     began = time.monotonic()
     base = "/dev/shm" if Path("/dev/shm").is_dir() else None
     with tempfile.TemporaryDirectory(dir=base) as folder:
-        damage = storm(Path(folder), options.kills, 2, options.seed, options.minutes)
+        damage = storm(Path(folder), options.kills, options.seeds, options.seed, options.minutes)
     redone = {count: damage.redone.count(count) for count in sorted(set(damage.redone))}
     print(f"{damage.kills} kills, {damage.cuts} of them with the power cut, {time.monotonic() - began:.0f} s")
     print(f"{damage.pipelines} pipelines, {damage.units} units of work finished, last finished unit: {damage.where}")

@@ -3,7 +3,8 @@
 import errno
 import os
 import random
-import shutil
+import re
+import resource
 import subprocess
 import zipfile
 from datetime import UTC, datetime
@@ -17,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
-from wbm.artifacts import backend, compare, migrate, zarr_io
+from wbm.artifacts import backend, compare, lineage, migrate, zarr_io
 from wbm.artifacts import manifest as manifests
 from wbm.artifacts import store as stores
 from wbm.artifacts.digest import canonical_json, digest_bytes, digest_content, digest_file, plain
@@ -201,27 +202,76 @@ def small_disk(tmp_path):
 
 
 def test_disk_full_at_any_point_loses_nothing(small_disk):
+    """Room for 0, 1, 2 ... pages: wherever publishing stops, nothing is lost, and with more room it goes on."""
     store = Store.open(small_disk)
     kept = publish(store, {"a": b"1" * 5000}, name="kept")
-    for room in (0, 4096, 8192, 16384, 32768, 65536):
+    finished, room = False, 0
+    while not finished:
         ballast = small_disk / "ballast"
         stat = os.statvfs(small_disk)
         ballast.write_bytes(b"0" * max(0, stat.f_bavail * stat.f_frsize - room))
-        try:
-            draft = store.begin(manifest(name="next", seed=room))
-        except (ArtifactError, OSError):
-            draft = None
-        if draft:
-            with pytest.raises(OSError, match="No space left"):
-                for i in range(200):
-                    (draft.path / f"{i}").write_bytes(b"2" * 4000)
-            draft.keep()
-        assert store.names() == [kept.ref]
-        assert store.verify() == []
+        finished = attempt(store, room)
+        assert set(store.names()) <= {kept.ref, manifest(name="next", seed=room).ref}
+        assert store.verify() == [], f"room for {room} bytes"
         ballast.unlink()
-        shutil.rmtree(small_disk / ".staging", ignore_errors=True)
-    publish(store, {"a": b"2"}, name="next")
-    assert store.verify() == []
+        assert attempt(store, room), "with room the same call goes on"
+        assert store.verify() == []
+        store.remove("assets/next")
+        lineage.collect(store, lineage.garbage(store, grace_s=0), grace_s=0)
+        room += 4096
+    assert room > 10 * 4096, "there should be many points to stop at"
+    assert store.names() == [kept.ref]
+
+
+def attempt(store, seed):
+    """Publish some files, the missing ones of an earlier attempt; whether it worked."""
+    asked = manifest(name="next", seed=seed)
+    if store.find(asked.kind, asked.name, asked.key):
+        store.set_latest(asked.kind, asked.name, asked.key)
+        return True
+    draft = None
+    try:
+        draft = store.begin(asked)
+        for i in range(4):
+            (draft.path / f"{i}").write_bytes(b"2" * 6000)
+        draft.publish()
+        return True
+    except (ArtifactError, OSError) as error:
+        assert "No space left" in str(error) or "File too large" in str(error)
+        if draft:
+            draft.keep()
+        return False
+
+
+def test_a_limit_on_the_size_of_files_loses_nothing(tmp_path):
+    """The same without a file system of one's own: every write beyond the limit fails."""
+    store = Store.open(tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    results = []
+    for limit in (0, 50, 300, 1500, 5999, 6000):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+        try:
+            results.append(attempt(store, limit))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert store.verify() == []
+        assert attempt(store, limit)
+    assert results == [False] * 5 + [True]
+    assert len(store.names()) == 6 and store.verify() == []
+
+
+def test_a_store_over_two_file_systems_says_so(tmp_path, monkeypatch):
+    store = Store.open(tmp_path)
+    draft = store.begin(manifest())
+    (draft.path / "a").write_text("1")
+    with monkeypatch.context() as patch:
+        patch.setattr(backend.os, "rename", lambda *_: (_ for _ in ()).throw(OSError(errno.EXDEV, "cross-device")))
+        with pytest.raises(ArtifactError, match=r"another file system .*artifacts\.root=DIR"):
+            draft.publish()
+    draft.keep()
+    assert store.names() == []
+    store.begin(manifest()).publish()
+    assert (store.resolve("assets").path / "a").read_text() == "1"
 
 
 def test_a_read_only_store_says_so_and_still_reads(small_disk):
@@ -249,8 +299,9 @@ def test_a_clock_that_goes_backwards_does_not_matter(tmp_path, monkeypatch):
     assert store.resolve("assets").ref == second.ref
 
 
+@pytest.mark.parametrize("code", [errno.EIO, errno.ESTALE, errno.ENOENT])
 @pytest.mark.parametrize("late", [False, True])
-def test_a_rename_that_fails_as_on_nfs(tmp_path, monkeypatch, late):
+def test_a_rename_that_fails_as_on_nfs(tmp_path, monkeypatch, late, code):
     """NFS may report an error before, or after, the rename took place."""
     store = Store.open(tmp_path)
     draft = store.begin(manifest())
@@ -262,14 +313,14 @@ def test_a_rename_that_fails_as_on_nfs(tmp_path, monkeypatch, late):
             failed.append(1)
             if late:
                 real(source, target)
-            raise OSError(errno.EIO, "Input/output error")
+            raise OSError(code, os.strerror(code))
         return real(source, target)
 
     monkeypatch.setattr(backend.os, "rename", rename)
     if late:
         draft.publish()
     else:
-        with pytest.raises(OSError, match="Input/output"):
+        with pytest.raises(OSError, match=re.escape(os.strerror(code))):
             draft.publish()
         assert store.names() == []
         draft.keep()

@@ -184,11 +184,11 @@ def test_what_has_no_reference_result_is_made(new, tmp_path):
 
 
 def test_inputs_are_checked_by_slot_and_kind(new):
-    code, _, err = wbm("run", "+inputs.asets=reference/assets", *new)
-    assert code == 2 and "+inputs.asets: no stage has this input; did you mean 'assets'?" in err
-    code, _, err = wbm("run", "+inputs.assets=reference/student", *new)
+    code, _, err = wbm("run", "inputs.asets=reference/assets", *new)
+    assert code == 2 and "inputs.asets: no stage has this input; did you mean 'assets'?" in err
+    code, _, err = wbm("run", "inputs.assets=reference/student", *new)
     assert code == 2 and "reference/student is of kind student, this input takes assets" in err
-    assert wbm("distill", "+inputs.assets=reference/assets", *new)[0] == 0
+    assert wbm("distill", "inputs.assets=reference/assets", *new)[0] == 0
 
 
 def test_one_teacher_of_a_suite_is_replaced_by_name(tmp_path, monkeypatch):
@@ -204,7 +204,7 @@ def test_one_teacher_of_a_suite_is_replaced_by_name(tmp_path, monkeypatch):
         return plan.build(stages, overrides, lambda lines: compose(lines).config, store, **options)[-1]
 
     assert rollouts().fixed == {}
-    for node in (rollouts("+inputs.teacher_side=reference/teacher_side"), rollouts(reference=True)):
+    for node in (rollouts("inputs.teacher_side=reference/teacher_side"), rollouts(reference=True)):
         assert {k: m.ref for k, m in node.fixed.items()} == {"teacher/side": side.ref}
         assert sorted(node.upstream) == ["assets", "teacher/top_down"]
 

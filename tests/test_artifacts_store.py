@@ -4,9 +4,8 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from artifacts_support import manifest, publish, s3_server
@@ -15,8 +14,6 @@ from wbm.artifacts import lease, lineage, transfer
 from wbm.artifacts.errors import ArtifactError, Conflict, Missing
 from wbm.artifacts.lease import acquire
 from wbm.artifacts.store import Store
-
-RACERS = 64 if os.environ.get("WBM_FULL") else 16
 
 
 @pytest.fixture(scope="module")
@@ -202,45 +199,50 @@ def test_a_renewing_holder_is_not_replaced(store, monkeypatch):
     held.release()
 
 
-def test_racing_writers_of_one_reference_are_linearizable(store):
-    """Each writer increments a counter by compare-and-swap: no update is lost, and each value is seen once."""
-    seen, backend = [], store.backend
-    writers = RACERS if store.backend.url.startswith("s3") else 64
+def test_64_racing_writers_leave_a_linearizable_history(store):
+    """Four processes with 16 threads each: a counter by compare-and-swap, `latest`, and one key to publish.
 
-    def increment(_):
-        while True:
-            found = backend.read("refs/counter")
-            value = json.loads(found[0]) if found else 0
-            try:
-                backend.write("refs/counter", json.dumps(value + 1).encode(), found[1] if found else "")
-            except Conflict:
-                continue
-            seen.append(value + 1)
-            return
+    A history of a counter is linearizable when no operation that ended before another began saw, or wrote, more.
+    """
+    racer, paths = Path(__file__).parent / "artifacts_racer.py", [Path(__file__).parent, Path(__file__).parent.parent]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
+    commands = [[sys.executable, racer, store.backend.url, "16", str(16 * i)] for i in range(4)]
+    racing = [subprocess.Popen(c, env=env, stdout=subprocess.PIPE, text=True) for c in commands]
+    answers = [json.loads(process.communicate(timeout=300)[0]) for process in racing]
+    history = [operation for answer in answers for operation in answer["history"]]
+    written = sorted(value for kind, value, *_ in history if kind == "write")
+    assert written == list(range(1, 65)), "no update is lost, none is made twice"
+    assert not_linearizable(history) is None
+    generation = json.loads(store.backend.read("refs/race/newest/latest")[0])["generation"]
+    assert generation == 64, "every writer of `latest` took a turn of its own"
+    (winner,) = [number for answer in answers for number in answer["winners"]]
+    assert (store.resolve("assets/one").path / "who").read_text() == str(winner)
+    assert store.verify([store.resolve("assets/one").ref]) == []
 
-    with ThreadPoolExecutor(writers) as pool:
-        list(pool.map(increment, range(writers)))
-    assert sorted(seen) == list(range(1, writers + 1))
-    assert json.loads(backend.read("refs/counter")[0]) == writers
+
+def not_linearizable(history):
+    """Two operations in the wrong order, None when there are no such: each is (kind, value, begin, end)."""
+    largest = (0, 0)  # what a finished operation has shown: the value, and whether it was read or written
+    ended = sorted(history, key=lambda op: op[3])
+    done = 0
+    for operation in sorted(history, key=lambda op: op[2]):
+        while ended[done][3] < operation[2]:
+            largest = max(largest, (ended[done][1], 0))
+            done += 1
+        kind, value = operation[:2]
+        if value < largest[0] or (kind == "write" and value == largest[0]):
+            return largest, operation
+    for kind, value, _, end in history:  # nothing is read before somebody began to write it
+        if kind == "read" and value and end < next(op[2] for op in history if op[:2] == ["write", value]):
+            return kind, value
+    return None
 
 
-def test_racing_publishers_of_one_key_give_one_artifact(store):
-    barrier = threading.Barrier(RACERS)
-
-    def attempt(number):
-        barrier.wait()
-        try:
-            draft = store.begin(manifest())
-        except Conflict:
-            return None
-        (draft.path / "who").write_text(str(number))
-        return draft.publish() and number
-
-    with ThreadPoolExecutor(RACERS) as pool:
-        winners = [n for n in pool.map(attempt, range(RACERS)) if n is not None]
-    assert len(winners) == 1
-    assert (store.resolve("assets/main").path / "who").read_text() == str(winners[0])
-    assert store.verify() == []
+def test_the_check_of_histories_finds_what_is_wrong():
+    good = [["read", 0, 0, 1], ["write", 1, 2, 5], ["read", 0, 3, 4], ["read", 1, 4, 6], ["write", 2, 7, 8]]
+    assert not_linearizable(good) is None
+    for bad in (["read", 0, 6, 7], ["write", 1, 9, 10], ["read", 2, 5, 6]):
+        assert not_linearizable([*good, bad]) is not None
 
 
 def test_push_and_pull_take_inputs_along_and_continue(store, tmp_path):

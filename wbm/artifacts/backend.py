@@ -225,11 +225,21 @@ def swap(left: Path, right: Path) -> None:
 
 
 def _rename(staged: Path, target: Path) -> None:
-    """Rename, believing the result rather than the error: NFS reports a repeated request as a failure."""
+    """Rename, believing the result rather than the error: NFS reports a repeated request as a failure.
+
+    Raises:
+        ArtifactError: the two are on different file systems.
+        OSError: it did not take place.
+    """
     try:
         os.rename(staged, target)
-    except OSError:
-        if staged.exists() or not (target / MANIFEST).is_file():
+    except OSError as error:
+        if error.errno == errno.EXDEV:
+            raise ArtifactError(
+                f"{target.parent} is on another file system than {staged.parent}: a store must lie on one; move it, or "
+                "set artifacts.root=DIR, and run again"
+            ) from error
+        if os.path.lexists(staged) or not os.path.isfile(target / MANIFEST):
             raise
 
 

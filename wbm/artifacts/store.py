@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import shutil
 import time
 from collections.abc import Iterable, Sequence
@@ -21,7 +22,7 @@ from wbm.artifacts.manifest import MANIFEST, NAME, Artifact, Manifest, check_fil
 from wbm.artifacts.reference import References, is_reference
 
 KINDS = ("assets", "teacher", "rollouts", "student", "evaluation", "bundle")
-_RETRIES = 1000
+_RETRIES = 100
 
 
 @dataclass
@@ -171,7 +172,7 @@ class Store:
     def set_latest(self, kind: str, name: str, key: str) -> None:
         """Move the reference `latest` by compare-and-swap."""
         path = f"refs/{kind}/{name}/latest"
-        for _ in range(_RETRIES):
+        for attempt in range(_RETRIES):
             found = self.backend.read(path)
             current = json.loads(found[0]) if found else {"generation": 0, "key": None}
             if current["key"] == key:
@@ -181,7 +182,9 @@ class Store:
                 self.backend.write(path, record, found[1] if found else ABSENT)
                 return
             except Conflict:
-                continue
+                time.sleep(
+                    random.uniform(0.0, min(0.5, 0.002 * 2 ** min(attempt, 9)))
+                )  # many writers must not keep step
         raise Conflict(f"{path}: other processes keep changing it; try again")
 
     def staging(self, ref: str) -> Path:
