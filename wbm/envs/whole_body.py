@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -89,8 +90,8 @@ class WholeBodyEnv(GraspEnv):
             self._corner[env, : len(corners)] = torch.as_tensor(corners, dtype=torch.float32)
             self._corners[env] = len(corners)
 
-    def _begin(self, ids: Tensor) -> None:
-        super()._begin(ids)
+    def _begin(self, ids: Tensor, episodes: np.ndarray) -> None:
+        super()._begin(ids, episodes)
         # The pre-grasp's pose in the world, by the same kinematics that will be asked to reach it.
         keep = self.q_in.clone()
         self.q_in[ids] = self._goal_q[ids].to(self.q_in)
