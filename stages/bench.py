@@ -17,6 +17,7 @@ SUITES = {
     "sensors": "wbm.sensors.bench:bench_sensors",
     "data": "wbm.learning.bench:bench_data",
     "student": "wbm.learning.bench:bench_student",
+    "env": "wbm.learning.bench_env:bench_env",
 }
 
 

@@ -22,8 +22,12 @@ artifacts_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="L
 app.add_typer(artifacts_app, name="artifacts")
 robot_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The robot that everything is built on.")
 app.add_typer(robot_app, name="robot")
-bundle_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made.")
+bundle_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Look at what deploy-export made, and try it out."
+)
 app.add_typer(bundle_app, name="bundle")
+jobs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="What was submitted to the cluster.")
+app.add_typer(jobs_app, name="jobs")
 
 STAGES = {
     "prepare-assets": "Stage 1: objects, convex parts, settled scenes.",
@@ -43,7 +47,7 @@ Items = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="[ARTIFACT]... [artifacts.root=DIR]",
-        help="kind/name[/key] or reference/name.",
+        help="kind/name[/key] or reference[/name].",
         show_default=False,
     ),
 ]
@@ -53,8 +57,14 @@ Multi = Annotated[bool, typer.Option("-m", "--multirun", help="Sweep: a,b and ra
 Launcher = Annotated[str, typer.Option("--launcher", help="Where to run: local or slurm.")]
 Detach = Annotated[bool, typer.Option("--detach", help="Submit and return at once.")]
 Force = Annotated[bool, typer.Option("--force", help="Run even if up to date, from the beginning.")]
+Source = Annotated[
+    str | None, typer.Option("--from", metavar="reference", help="Let reference results stand in for long stages.")
+]
 Until = Annotated[str | None, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Figure4 = Annotated[
+    bool, typer.Option("--figure4", help="The paper's three arms instead, every seed; continues where it stopped.")
+]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 
 
@@ -78,12 +88,13 @@ def run(
     detach: Detach = False,
     force: Force = False,
     until: Until = None,
+    source: Source = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """Run all six stages, skipping what is up to date."""
     _run(None, overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach, force=force,
-         until=until, as_json=as_json)  # fmt: skip
+         until=until, source=source, as_json=as_json)  # fmt: skip
 
 
 def _add_stage(name: str, text: str) -> None:
@@ -95,18 +106,47 @@ def _add_stage(name: str, text: str) -> None:
         launcher: Launcher = "local",
         detach: Detach = False,
         force: Force = False,
+        source: Source = None,
         debug: Debug = False,
         as_json: Json = False,
     ) -> None:
         _run(name, overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach, force=force,
-             as_json=as_json)  # fmt: skip
+             source=source, as_json=as_json)  # fmt: skip
 
     command.__doc__ = text
     app.command(name)(command)
 
 
+def _add_evaluate(text: str) -> None:
+    def command(
+        overrides: Overrides = None,
+        figure4: Figure4 = False,
+        cfg: Cfg = False,
+        info: Info = False,
+        multirun: Multi = False,
+        launcher: Launcher = "local",
+        detach: Detach = False,
+        force: Force = False,
+        debug: Debug = False,
+        as_json: Json = False,
+    ) -> None:
+        if figure4:
+            if cfg or info or multirun or detach or launcher != "local":
+                raise typer.BadParameter("--figure4 goes with --force, --debug and --json alone")
+            _call("commands_figure4", "figure4_command", overrides or [], force, as_json)
+            return
+        _run("evaluate", overrides, cfg=cfg, info=info, multirun=multirun, launcher=launcher, detach=detach,
+             force=force, as_json=as_json)  # fmt: skip
+
+    command.__doc__ = text
+    app.command("evaluate")(command)
+
+
 for _name, _text in STAGES.items():
-    _add_stage(_name, _text)
+    if _name == "evaluate":
+        _add_evaluate(_text)
+    else:
+        _add_stage(_name, _text)
 
 
 @app.command()
@@ -114,11 +154,16 @@ def plan(
     overrides: Overrides = None,
     check: Annotated[bool, typer.Option("--check", help="Exit with 3 when a stage would run.")] = False,
     until: Until = None,
+    source: Source = None,
+    figure4: Figure4 = False,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """Say which stages would run, and why."""
-    _call("commands", "plan_command", overrides or [], check, as_json, until)
+    if figure4:
+        _call("commands_figure4", "figure4_plan", overrides or [], check, as_json)
+    else:
+        _call("commands", "plan_command", overrides or [], check, as_json, until, source)
 
 
 @app.command("repro-diff")
@@ -218,6 +263,19 @@ def rm(items: Items = None, force: Force = False, debug: Debug = False, as_json:
     _call("commands_artifacts", "rm", items or [], force, as_json)
 
 
+@artifacts_app.command()
+def publish(
+    items: Items = None,
+    name: Annotated[str | None, typer.Option("--as", metavar="NAME", help="Default: the kind, or kind_name.")] = None,
+    without: Annotated[list[str] | None, typer.Option("--without", metavar="PATTERN", help="Leave files out.")] = None,
+    limit: Annotated[float, typer.Option("--limit-mb", help="Largest size of all reference results, MB.")] = 20.0,
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """Copy one to the reference results, to be committed."""
+    _call("commands_artifacts", "publish", items or [], name, without or [], limit, as_json)
+
+
 FilePath = Annotated[str, typer.Argument(metavar="PATH", help="A file or folder.")]
 
 
@@ -239,16 +297,76 @@ def robot_facts(debug: Debug = False) -> None:
     _call("commands_robot", "robot_facts")
 
 
+BundlePath = Annotated[str, typer.Argument(metavar="BUNDLE", help="A file, its folder, or bundle/NAME in the store.")]
+LogPath = Annotated[str, typer.Argument(metavar="LOG", help="A run's log, as RunLog wrote it (.mcap).")]
+Minutes = Annotated[float, typer.Option("--minutes", help="How long.")]
+RunLogPath = Annotated[str | None, typer.Option("--log", metavar="FILE", help="Also log as on a robot (MCAP).")]
+
+
 @bundle_app.command("show")
-def bundle_show(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+def bundle_show(path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """The contract and provenance of a bundle."""
-    _call("commands_robot", "bundle", path, False, as_json)
+    _call("commands_bundle", "show", path, overrides or [], as_json)
 
 
 @bundle_app.command("verify")
-def bundle_verify(path: FilePath, debug: Debug = False, as_json: Json = False) -> None:
+def bundle_verify(path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
     """Check every part of a bundle, and its golden vectors."""
-    _call("commands_robot", "bundle", path, True, as_json)
+    _call("commands_bundle", "verify", path, overrides or [], as_json)
+
+
+@bundle_app.command("replay")
+def bundle_replay(
+    log: LogPath, path: BundlePath, overrides: Overrides = None, debug: Debug = False, as_json: Json = False
+) -> None:
+    """Run a bundle on what another one saw, and compare the actions."""
+    _call("commands_bundle", "replay_log", log, path, overrides or [], as_json)
+
+
+@bundle_app.command("soak")
+def bundle_soak(
+    path: BundlePath,
+    overrides: Overrides = None,
+    minutes: Minutes = 10.0,
+    log: RunLogPath = None,
+    debug: Debug = False,
+    as_json: Json = False,
+) -> None:
+    """Closed loop in real time: deadlines, jitter, memory."""
+    _call("commands_bundle", "soak_bundle", path, overrides or [], minutes, log, as_json)
+
+
+@bundle_app.command("compare")
+def bundle_compare(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """Evaluate a bundle and its student on the same seeds."""
+    _call("commands_bundle", "compare", overrides or [], as_json)
+
+
+Submission = Annotated[str, typer.Argument(metavar="SUBMISSION", help="Its id, or the beginning of it, or latest.")]
+
+
+@jobs_app.command("ls")
+def jobs_ls(overrides: Overrides = None, debug: Debug = False, as_json: Json = False) -> None:
+    """List submissions and where their tasks are."""
+    _call("commands_jobs", "ls", overrides or [], as_json)
+
+
+@jobs_app.command("logs")
+def jobs_logs(
+    submission: Submission = "latest",
+    overrides: Overrides = None,
+    task: Annotated[str, typer.Option("--task", metavar="TASK", help="Only this one.")] = "",
+    lines: Annotated[int, typer.Option("-n", "--lines", help="Last lines of each log.")] = 20,
+    debug: Debug = False,
+) -> None:
+    """Show the logs of a submission."""
+    _call("commands_jobs", "logs", submission, overrides or [], task, lines)
+
+
+@jobs_app.command("cancel")
+def jobs_cancel(submission: Submission, overrides: Overrides = None, debug: Debug = False) -> None:
+    """Cancel all jobs of a submission."""
+    _call("commands_jobs", "cancel", submission, overrides or [])
 
 
 Remote = Annotated[str, typer.Argument(metavar="URL", help="s3://bucket/prefix or a directory.")]
@@ -289,19 +407,29 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code)
 
 
+_TOLD = (
+    "StageError", "Interrupted", "FactsError", "ArtifactError", "Missing", "Conflict", "LaunchError", "BundleError",
+    "Refused",
+)  # fmt: skip
+"""Errors whose text says what, where and what to do."""
+
+
 def _exit_code(error: BaseException) -> int:
     kind = type(error).__name__
     if hasattr(error, "exit_code") and hasattr(error, "format_message"):  # a usage error of Typer
-        return _complain(error.format_message(), 2)  # pyright: ignore[reportAttributeAccessIssue]
+        text: str = error.format_message().rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
+        path = getattr(getattr(error, "ctx", None), "command_path", "wbm")
+        return _complain(f"{text}; see `{path} --help`", 2)
     if kind == "Abort":
         return _complain("interrupted", 1)
     if kind == "ConfigError":
         return _complain(str(error), 2)
-    if kind in ("StageError", "FactsError", "Interrupted", "ArtifactError", "Missing", "Conflict"):
+    if kind in _TOLD:
         return _complain(str(error), 1)
     text = " ".join(str(error).split())
-    hint = "" if isinstance(error, OSError) else "; add --debug for the traceback"
-    return _complain(f"{kind}: {text}{hint}", 1)
+    if isinstance(error, OSError):
+        return _complain(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else text, 1)
+    return _complain(f"{text if kind == 'ValueError' else f'{kind}: {text}'}; add --debug for the traceback", 1)
 
 
 def _complain(message: str, code: int) -> int:

@@ -17,6 +17,7 @@ from stages.tables import metrics_text, seconds, size, table
 from wbm.artifacts import lineage
 from wbm.artifacts.compare import first_difference
 from wbm.artifacts.manifest import Manifest
+from wbm.artifacts.reference import WORD, is_reference, publish_reference
 from wbm.artifacts.store import Store
 from wbm.artifacts.transfer import copy_all
 
@@ -32,15 +33,19 @@ def split(items: Sequence[str], count: int | None = None) -> tuple[Store, list[s
     store = open_store(composer([item for item in items if "=" in item]))
     names = [item for item in items if "=" not in item]
     if (count == -1 and not names) or (count is not None and count >= 0 and len(names) != count):
-        raise ConfigError(
-            f"name {'at least one artifact' if count == -1 else f'{count} artifacts'}, as kind/name[/key]"
+        wanted = {-1: "at least one artifact", 0: "no artifact", 1: "one artifact"}.get(
+            count or 0, f"{count} artifacts"
         )
+        raise ConfigError(f"name {wanted}, as kind/name[/key]; `wbm artifacts ls` lists them")
     return store, names
 
 
 def ls(items: Sequence[str], as_json: bool) -> None:
     """List artifacts, all or those below the given kinds and names."""
     store, wanted = split(items)
+    if wanted and all(is_reference(w) for w in wanted):
+        _list_references(store, wanted, as_json)
+        return
     refs = [r for r in store.names() if not wanted or any(r == w or r.startswith(w.rstrip("/") + "/") for w in wanted)]
     pins = set(store.pins())
     rows: list[dict[str, Any]] = []
@@ -78,6 +83,34 @@ def ls(items: Sequence[str], as_json: bool) -> None:
         for r in rows
     ]
     sys.stdout.write(table(["artifact", "ref", "created", "size", "time", "metrics"], body))
+
+
+def _list_references(store: Store, wanted: Sequence[str], as_json: bool) -> None:
+    names = [n for n in store.references.names() if WORD in wanted or n in wanted]
+    found = {name: store.references.get(name).manifest for name in names}
+    if as_json:
+        emit(
+            [
+                {
+                    "artifact": name,
+                    "ref": m.ref,
+                    "created": m.created,
+                    "bytes": m.size,
+                    "files": len(m.files),
+                    "wall_time_s": m.wall_time_s,
+                    "content_digest": m.content_digest,
+                    "metrics": m.metrics,
+                }
+                for name, m in found.items()
+            ]
+        )
+        return
+    body = [
+        [name, m.ref, m.created, size(m.size), seconds(m.wall_time_s), metrics_text(m.metrics)]
+        for name, m in found.items()
+    ]
+    header = ["artifact", "published as", "created", "size", "time", "metrics"]
+    sys.stdout.write(table(header, body) if body else f"no reference results in {store.references.folder}\n")
 
 
 def show(items: Sequence[str], as_json: bool) -> None:
@@ -118,7 +151,7 @@ def why(items: Sequence[str], as_json: bool) -> None:
     """Print what an artifact was made from, and what was made from it."""
     store, names = split(items, 1)
     ref = store.manifest(names[0]).ref
-    manifests = lineage.load_all(store)
+    manifests = {m.ref: m for m in map(store.manifest, store.references.names())} | lineage.load_all(store)
     up, down = lineage.ancestors(ref, manifests), lineage.descendants(ref, manifests)
     if as_json:
         emit({"artifact": ref, "made_from": _branches(up), "used_by": _branches(down)})
@@ -181,9 +214,10 @@ def repro_diff(items: Sequence[str], as_json: bool) -> None:
 
 
 def verify(items: Sequence[str], as_json: bool) -> None:
-    """Check every byte; exit with 1 when something is wrong."""
+    """Check every byte, of the reference results too; exit with 1 when something is wrong."""
     store, names = split(items)
-    refs = names or store.names()
+    everything = [*store.names(), *store.references.names()]
+    refs = [r for n in names for r in (store.references.names() if n == WORD else [n])] if names else everything
     problems = [] if names else store.dangling()
     with Progress() as progress:
         for ref in progress.track(refs, "verify"):
@@ -231,6 +265,32 @@ def pin(items: Sequence[str], remove: bool, as_json: bool) -> None:
             sys.stdout.write(f"{'unpinned' if remove else 'pinned'} {name}\n")
 
 
+def publish(items: Sequence[str], name: str | None, without: Sequence[str], limit_mb: float, as_json: bool) -> None:
+    """Copy an artifact to the reference results."""
+    store, names = split(items, 1)
+    done = publish_reference(store.resolve(names[0]), store.references, name, without, limit_mb)
+    manifest, total = done.artifact.manifest, store.references.size()
+    if as_json:
+        emit(
+            {
+                "artifact": done.text,
+                "ref": manifest.ref,
+                "path": str(done.artifact.path),
+                "content_digest": manifest.content_digest,
+                "bytes": manifest.size,
+                "total_bytes": total,
+                "missing_inputs": done.missing_inputs,
+            }
+        )
+        return
+    sys.stdout.write(f"{done.text}  {size(manifest.size)} in {len(manifest.files)} files at {done.artifact.path}\n")
+    for ref in done.missing_inputs:
+        sys.stdout.write(f"  input {ref} is no reference result: known by its digest only\n")
+    if manifest.git.get("dirty"):
+        sys.stdout.write("  made with uncommitted changes: the manifest holds the patch\n")
+    sys.stdout.write(f"all reference results: {size(total)}; commit {store.references.folder}\n")
+
+
 def rm(items: Sequence[str], force: bool, as_json: bool) -> None:
     """Delete artifacts."""
     store, names = split(items, -1)
@@ -244,6 +304,8 @@ def rm(items: Sequence[str], force: bool, as_json: bool) -> None:
 
 def transfer(url: str, items: Sequence[str], push: bool, as_json: bool) -> None:
     """Copy artifacts with all their inputs between this store and another one; without a name, everything."""
+    if "=" in url:
+        raise ConfigError(f"{url}: name the other store first, as s3://bucket/prefix or a directory")
     store, names = split(items)
     other = Store.open(url)
     source, target = (store, other) if push else (other, store)

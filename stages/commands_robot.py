@@ -1,4 +1,4 @@
-"""`wbm robot` and `wbm bundle`: look at what the pipeline starts from, and at what it ends with."""
+"""`wbm robot`: look at what the pipeline starts from."""
 
 from __future__ import annotations
 
@@ -43,23 +43,3 @@ def robot_facts() -> None:
     from wbm.robot.facts import standard_text
 
     sys.stdout.write(standard_text())
-
-
-def bundle(path: str, verify: bool, as_json: bool) -> None:
-    """Show or verify a bundle: a file, or the folder of a `bundle` artifact.
-
-    Raises:
-        FileNotFoundError: there is no bundle.
-        BundleError: it is damaged; the message names the part.
-    """
-    from wbm.deploy.bundle import Bundle
-
-    place = Path(path)
-    opened = Bundle.open(place / "policy.wbm" if place.is_dir() else place)
-    answer = opened.verify() if verify else opened.show()
-    if as_json:
-        emit(answer)
-        return
-    for key, value in answer.items():
-        text = str(value)
-        sys.stdout.write(f"{key:<16} {text if len(text) <= 160 else text[:157] + '...'}\n")

@@ -84,11 +84,13 @@ def complete(words: Sequence[str]) -> list[str]:
         return _matching(word, [name for p in command.params for name in getattr(p, "opts", []) if name[0] == "-"])
     if before and before[-1] == "--until":
         return _matching(word, MODULES)
+    if before and before[-1] == "--from":
+        return _matching(word, ["reference"])
     if before and before[-1] == "--launcher":
         return _matching(word, ["local", "slurm"])
     if path == ["completion"]:
         return _matching(word, SCRIPTS)
-    if "=" not in word and (path[:1] == ["artifacts"] or path == ["repro-diff"]):
+    if "=" not in word and (path[:1] == ["artifacts"] or path in (["repro-diff"], ["view"])):
         return [*artifacts(word), *_matching(word, ["artifacts.root="])]
     return candidates(word)
 
@@ -101,7 +103,8 @@ def artifacts(word: str) -> list[str]:
     """Published artifacts that begin with `word`, level by level."""
     from stages.commands import composer, open_store
 
-    names = open_store(composer([])).names()
+    store = open_store(composer([]))
+    names = [*store.names(), *store.references.names()]
     depth = word.count("/") + 1
     return _matching(word, ["/".join(n.split("/")[:depth]) + ("/" if depth == 1 else "") for n in names])
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast, get_args, get_origin
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
@@ -81,8 +81,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         try:
             parsed += parser.parse_overrides([line])
         except HydraException as error:
-            reason = str(error).splitlines()[0].removesuffix(".")
-            raise ConfigError(f"cannot read override '{line}' ({reason}); write key=value") from error
+            raise ConfigError(f"cannot read override '{line}'; write key=value, without spaces") from error
     return parsed
 
 
@@ -106,10 +105,14 @@ def _compose(overrides: tuple[str, ...]) -> Composed:
 
 
 def _compose_raw(overrides: Sequence[str]) -> DictConfig:
-    for item in parse(overrides):
+    items = parse(overrides)
+    for item in items:
         _check_override(item)
+    # An entry of a mapping, such as inputs.assets=NAME, is new to Hydra, which would ask for a plus sign.
+    added = [_is_entry(item) and not (item.is_add() or item.is_delete()) for item in items]
+    lines = [f"++{line}" if new else line for new, line in zip(added, overrides, strict=True)]
     try:
-        return hydra_compose(CONFIG_NAME, overrides=list(overrides), return_hydra_config=True)
+        return hydra_compose(CONFIG_NAME, overrides=lines, return_hydra_config=True)
     except Exception as error:  # Hydra raises whatever its parts raise, AssertionError and TypeError among them
         raise ConfigError(_one_line(error)) from error
 
@@ -157,6 +160,16 @@ def _check_override(item: Override) -> None:
             raise ConfigError(f"unknown key '{key}'{nearest('.'.join([*walked, part]), words)}")
         hint = known[part]
         walked.append(part)
+
+
+def _is_entry(item: Override) -> bool:
+    """Whether an override sets an entry of a field that is a mapping."""
+    hint: Any = Config
+    for part in item.key_or_group.split("."):
+        if get_origin(hint) is dict:
+            return True
+        hint = hints(hint).get(part) if isinstance(hint, type) and is_dataclass(hint) else None
+    return False
 
 
 def _one_line(error: Exception) -> str:

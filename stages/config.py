@@ -13,7 +13,9 @@ from wbm.control.config import WbcConfig
 from wbm.deploy.config import DeployConfig
 from wbm.envs.config import EnvConfig
 from wbm.envs.rollout_config import RolloutsConfig
+from wbm.launch.config import LauncherConfig
 from wbm.learning.config import PpoConfig, TeacherConfig
+from wbm.learning.figure4_config import Figure4Config
 from wbm.learning.student_config import DistillConfig, StudentConfig
 from wbm.report.config import EvaluationConfig
 from wbm.robot.config import MjcfOptions
@@ -29,8 +31,8 @@ class Config:
     Attributes:
         seed: the seed from which all others derive.
         note: free text for the manifest; never part of a key.
-        policy: what to evaluate or export, as `kind/name[/key]` or `reference/name`; default: the student.
-        inputs: input slot -> artifact to use in place of the newest one.
+        policy: what to evaluate or export, as `kind/name[/key]` or `reference[/name]`; default: the student.
+        inputs: input slot -> artifact to use in place of the newest one; `teacher_NAME` is one teacher of the suite.
         teachers: the suite: names of presets in `conf/teacher/`.
 
     The other attributes are the sections; their dataclasses document them.
@@ -42,6 +44,7 @@ class Config:
     inputs: dict[str, str] = field(default_factory=dict)
     teachers: tuple[str, ...] = ("top_down", "side")
     artifacts: ArtifactsConfig = field(default_factory=ArtifactsConfig)
+    launcher: LauncherConfig = field(default_factory=LauncherConfig)
     robot: MjcfOptions = field(default_factory=MjcfOptions)
     wbc: WbcConfig = field(default_factory=WbcConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
@@ -55,4 +58,5 @@ class Config:
     student: StudentConfig = field(default_factory=StudentConfig)
     distill: DistillConfig = field(default_factory=DistillConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    figure4: Figure4Config = field(default_factory=Figure4Config)
     deploy: DeployConfig = field(default_factory=DeployConfig)

@@ -60,7 +60,8 @@ def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
         # Check the finished file, as a robot would
         bundle = Bundle.open(path)
         facts = bundle.verify()
-        replayed = rollout_parity(policy, bundle.policy(), inputs["evaluation"].path)
+        gaps = rollout_parity(policy, bundle.policy(), inputs["evaluation"].path)
+        replayed = None if gaps is None else float(gaps.max())
         if replayed is not None and replayed > cfg.deploy.parity_tolerance:
             raise ValueError(
                 f"on a replayed episode the bundle differs from torch by {replayed:.2g}, "

@@ -49,16 +49,13 @@ def golden_observations(schema: PolicySchema, evaluation: Path, count: int) -> d
     return golden
 
 
-def rollout_parity(policy: StudentPolicy, onnx: OnnxPolicy, evaluation: Path) -> float | None:
-    """Largest difference between torch and ONNX over a recorded episode, one step at a time; None without one."""
+def rollout_parity(policy: StudentPolicy, onnx: OnnxPolicy, evaluation: Path) -> np.ndarray | None:
+    """Largest difference between torch and ONNX in each step [T] of a recorded episode; None without one."""
     episode = recorded_episode(policy.schema, evaluation)
     if episode is None:
         return None
-    gaps = []
-    for k in range(len(episode["proprio"])):
-        step = {name: values[k : k + 1] for name, values in episode.items()}
-        gaps.append(np.abs(onnx(step) - policy.act(step).cpu().numpy()).max())
-    return float(np.max(gaps))
+    steps = [{name: values[k : k + 1] for name, values in episode.items()} for k in range(len(episode["proprio"]))]
+    return np.array([np.abs(onnx(step) - policy.act(step).cpu().numpy()).max() for step in steps])
 
 
 def normalisers(policy: StudentPolicy) -> dict[str, tuple[np.ndarray, np.ndarray]]:

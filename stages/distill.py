@@ -16,6 +16,11 @@ def name(cfg: Any) -> str:
     return "main"
 
 
+def uses_gpu(cfg: Any) -> bool:
+    """Whether the student learns on a GPU."""
+    return cfg.distill.device != "cpu"
+
+
 def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
     """Train on the rollouts' shards; publish weights, specification and learning curve."""
     from dataclasses import replace

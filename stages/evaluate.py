@@ -30,13 +30,16 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     from wbm.report.page import write_page
     from wbm.report.stats import summarise
 
+    policy = inputs["policy"].manifest
+    _check_kind(policy)
     records = _play(cfg, inputs, draft, progress)
     _film(cfg, inputs, draft, progress, records)
     summary = summarise(records)
+    if policy.kind == "bundle":
+        summary["refusals"] = _refusals(records)
     plain = [{k: v for k, v in r.items() if k not in ("video", "filmstrip")} for r in records]
     _write(draft.path / "summary.json", summary)
     _write(draft.path / "records.json", plain)
-    policy = inputs["policy"].manifest
     result = {
         **summary,
         "records": records,
@@ -49,33 +52,84 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     draft.metrics |= summary
 
 
+def uses_gpu(cfg: Any) -> bool:
+    """The physics engine decides."""
+    return cfg.sim.engine == "mujoco_warp"
+
+
+def _check_kind(policy: Any) -> None:
+    from wbm.learning.evaluation import POLICY_KINDS
+
+    if policy.kind not in POLICY_KINDS:
+        raise ValueError(f"policy={policy.ref} holds no policy; name a {', '.join(POLICY_KINDS[:-1])} or bundle")
+
+
+def _refusals(records: list[dict[str, Any]]) -> dict[str, int]:
+    """What a bundle's runtime refused over all episodes, by name."""
+    from collections import Counter
+
+    return dict(sorted(sum((Counter(r["refusals"]) for r in records), Counter()).items()))
+
+
 def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[dict[str, Any]]:
     """Play what is missing; a finished block is a file in the scratch folder, from which an interrupted run goes on."""
+    import shutil
+
+    from wbm.artifacts.files import fsync_tree, write_atomic
     from wbm.envs.world import WorldConfig
     from wbm.learning.evaluation import BlockJob
     from wbm.learning.workers import run_jobs
 
     e, policy = cfg.evaluation, inputs["policy"]
     world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
+    split = e.split
+    if split == "test" and _strange(inputs["assets"].manifest, policy.manifest, draft.store):
+        split = "all"
+        progress.message("nobody trained on these objects: evaluating on all of them")
     blocks = draft.scratch / "blocks"
     blocks.mkdir(parents=True, exist_ok=True)
     jobs = [
         BlockJob(
             first, min(BLOCK, e.episodes - first), blocks, inputs["assets"].path, policy.path,
             policy.manifest.kind, world,
-            cfg.sensors, e.split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
+            cfg.sensors, split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
             cfg.seed + e.seed,
         )
         for first in range(0, e.episodes, BLOCK)
     ]  # fmt: skip
     waiting = [job for job in jobs if not _block(blocks, job.first).is_file()]
+    if any(job.first < e.record_episodes for job in waiting):
+        shutil.rmtree(blocks / "episodes", ignore_errors=True)  # of a block that did not finish
     with progress.task("episodes", total=e.episodes) as task:
         task.update(e.episodes - sum(job.count for job in waiting))
         for result in run_jobs("wbm.learning.evaluation", waiting, e.workers):
-            _write(_block(blocks, result.first), result.records)
+            fsync_tree(blocks)  # its trajectories and episodes, before the file that says that they are there
+            write_atomic(_block(blocks, result.first), _json(result.records))
             won = sum(r["success"] for r in result.records)
             task.update(len(result.records), success=won / len(result.records))
+            progress.safe_point()
     return [r for job in jobs for r in json.loads(_block(blocks, job.first).read_text())]
+
+
+def _strange(assets: Any, policy: Any, store: Any) -> bool:
+    """Whether the assets hold imported objects and the policy was trained on other assets."""
+    from wbm.artifacts.errors import ArtifactError
+
+    if assets.config.get("objects", {}).get("source") not in ("meshes", "pybullet"):
+        return False
+    waiting, known = list(policy.inputs.values()), False
+    while waiting:
+        ref = waiting.pop()
+        if ref.ref.startswith("assets/"):
+            if ref.content_digest == assets.content_digest:
+                return False
+            known = True
+            continue
+        try:
+            waiting += store.manifest(ref.ref).inputs.values()
+        except ArtifactError:
+            return False  # what it was trained on is no longer known
+    return known
 
 
 def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: list[dict[str, Any]]) -> None:
@@ -85,7 +139,7 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
     import numpy as np
 
     from wbm.artifacts.episode_reader import EpisodeReader, shard_paths
-    from wbm.report.films import FilmStudio, Trajectory, choose_films
+    from wbm.report.films import FilmStudio, Trajectory, choose_films, choose_strips
     from wbm.report.tracks import scene_solids, write_episode_mcap
     from wbm.robot.schema import PolicySchema
     from wbm.scenes.assets import load_assets
@@ -93,7 +147,7 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
     e, blocks = cfg.evaluation, draft.scratch / "blocks"
     assets, period = load_assets(inputs["assets"].path), 1.0 / PolicySchema().rate_hz
     chosen = choose_films(records, e.videos)
-    strips = [i for i, r in enumerate(records) if r["success"]][: e.filmstrips]
+    strips = choose_strips(records, e.filmstrips)
     if chosen or strips:
         studio = FilmStudio(assets, (e.video_width, e.video_height))
         folder = draft.path / "videos"
@@ -118,7 +172,9 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
             for i, info in enumerate(reader.episodes):
                 target = draft.path / "mcap" / f"episode-{info.seed:04d}.mcap"
                 target.parent.mkdir(exist_ok=True)
-                write_episode_mcap(target, reader.read_episode(i), schema, scene_solids(assets, int(info.scene)))
+                episode = reader.read_episode(i)
+                solids = scene_solids(assets, int(info.scene), np.asarray(episode["p_obj_w"], dtype=np.float64))
+                write_episode_mcap(target, episode, schema, solids)
 
 
 def _curves(curve: Any, kind: str) -> dict[str, Any]:
@@ -145,6 +201,8 @@ def _plain(settings: Any) -> dict[str, Any]:
 
 
 def _write(path: Path, value: Any) -> None:
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    partial.replace(path)
+    path.write_bytes(_json(value))
+
+
+def _json(value: Any) -> bytes:
+    return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()

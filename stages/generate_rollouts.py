@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
+
+from stages.registry import PARTS
 
 KIND = "rollouts"
 SECTIONS = ("seed", "robot", "sim", "wbc", "sensors", "env", "rollouts")
 INPUTS = ("assets", "teacher/*")
 REPORTS = "reports"
+SHARDS = "shards"
 
 
 def name(cfg: Any) -> str:
@@ -25,35 +30,85 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
         draft: shards go to `draft.path/shards`, a report of each to `draft.path/reports`.
         progress: offers `task`.
     """
-    from wbm.envs.world import WorldConfig
-    from wbm.learning.rollouts import ShardJob, ShardReport, merge_reports
+    from wbm.learning.rollouts import ShardReport, merge_reports
     from wbm.learning.workers import run_jobs
 
-    world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
-    teachers = {slot.partition("/")[2]: art.path for slot, art in inputs.items() if slot.startswith("teacher/")}
-    folder, reports = draft.path / "shards", draft.path / REPORTS
+    folder, reports = draft.path / SHARDS, draft.path / REPORTS
     reports.mkdir(parents=True, exist_ok=True)
-    assets = inputs["assets"].path
-    jobs = [
-        ShardJob(i, folder, assets, teachers, world, cfg.sensors, cfg.rollouts, cfg.seed)
-        for i in range(cfg.rollouts.shards)
-    ]
-    # A shard is done when its index and its report are there; anything less is made again.
-    waiting = [job for job in jobs if not (reports / f"{job.shard:05d}.json").exists()]
+    _take_parts(draft.path)
+    jobs = [_job(cfg, inputs, i, folder) for i in range(cfg.rollouts.shards)]
+    # A shard is done when its report is on the disk, which is flushed after the shard; anything less is made again.
+    waiting = [job for job in jobs if not _report(reports, job.shard).exists()]
+    for job in waiting:
+        (folder / f"shard-{job.shard:05d}.json").unlink(missing_ok=True)  # finished, but its report was lost
     with progress.task("rollouts", total=len(jobs)) as task:
         task.update(len(jobs) - len(waiting))
         for report in run_jobs("wbm.learning.rollouts", waiting, cfg.rollouts.workers):
-            path = reports / f"{report.shard:05d}.json"
-            partial = path.with_suffix(".partial")
-            partial.write_text(json.dumps(report.to_dict(), sort_keys=True) + "\n", encoding="utf-8")
-            partial.replace(path)
+            _write_report(reports, report)
             task.update(1, kept=report.kept)
-    done = [ShardReport(**json.loads((reports / f"{job.shard:05d}.json").read_text())) for job in jobs]
+            progress.safe_point()
+    done = [ShardReport(**json.loads(_report(reports, job.shard).read_text())) for job in jobs]
     totals = merge_reports(done)
     if totals["kept"] == 0:
         raise ValueError("no episode succeeded, so there is nothing to learn from; train the teachers longer")
     draft.metrics |= totals
     _samples(cfg, draft, folder)
+
+
+def parts(cfg: Any) -> int:
+    """A part is a shard."""
+    return cfg.rollouts.shards
+
+
+def make_parts(cfg: Any, inputs: dict[str, Any], places: dict[int, Path], workers: int) -> Iterator[int]:
+    """Make shards, each in a folder of its own with its report."""
+    from wbm.learning.workers import run_jobs
+
+    jobs = [_job(cfg, inputs, number, place / SHARDS) for number, place in places.items()]
+    for report in run_jobs("wbm.learning.rollouts", jobs, workers):
+        _write_report(places[report.shard] / REPORTS, report)
+        yield report.shard
+
+
+def uses_gpu(cfg: Any) -> bool:
+    """The physics engine decides."""
+    return cfg.sim.engine == "mujoco_warp"
+
+
+def _job(cfg: Any, inputs: dict[str, Any], shard: int, folder: Path) -> Any:
+    from wbm.envs.world import WorldConfig
+    from wbm.learning.rollouts import ShardJob
+
+    world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
+    teachers = {slot.partition("/")[2]: art.path for slot, art in inputs.items() if slot.startswith("teacher/")}
+    return ShardJob(shard, folder, inputs["assets"].path, teachers, world, cfg.sensors, cfg.rollouts, cfg.seed)
+
+
+def _report(reports: Path, shard: int) -> Path:
+    return reports / f"{shard:05d}.json"
+
+
+def _write_report(reports: Path, report: Any) -> None:
+    from wbm.artifacts.files import write_atomic
+
+    write_atomic(_report(reports, report.shard), (json.dumps(report.to_dict(), sort_keys=True) + "\n").encode())
+
+
+def _take_parts(path: Path) -> None:
+    """Bring the shards that other jobs made to where this stage makes them; a shard's report comes last."""
+    from wbm.artifacts.shards import sweep_partials
+
+    if not (path / PARTS).is_dir():
+        return
+    sweep_partials(path / PARTS)
+    (path / SHARDS).mkdir(exist_ok=True)
+    for part in sorted((path / PARTS).iterdir()):
+        for below in (SHARDS, REPORTS):
+            for item in sorted((part / below).glob("*"), key=lambda p: p.suffix == ".json"):
+                item.rename(path / below / item.name)
+            (part / below).rmdir()
+        part.rmdir()
+    (path / PARTS).rmdir()
 
 
 def _samples(cfg: Any, draft: Any, folder: Any) -> None:

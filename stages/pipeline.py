@@ -4,31 +4,33 @@ from __future__ import annotations
 
 import errno
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from concurrent.futures import BrokenExecutor
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from stages.plan import Node, because, look_up
+from stages.plan import Node, look_up
 from stages.progress import Progress
 from stages.provenance import command_line, environment, git_state
+from stages.reasons import because
 from wbm.artifacts.errors import ArtifactError
+from wbm.artifacts.lease import TERM_S
 from wbm.artifacts.manifest import Manifest
-from wbm.artifacts.store import Artifact, Draft, Store
+from wbm.artifacts.store import Artifact, Draft, Store, scratch_of
+from wbm.launch.stop import Stopped, StopSignal
 
 
 class StageError(Exception):
     """A stage failed; the message says which, why, and where its output is."""
 
 
-class Interrupted(BaseException):
-    """The user or the scheduler asked the run to stop; what is finished is kept.
-
-    No `Exception`, so that a stage that catches those does not swallow it.
-    """
+class Interrupted(Stopped):
+    """The user or the scheduler asked the run to stop; what is finished is kept."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,13 @@ def run_nodes(
     return outcomes
 
 
-def run_node(node: Node, store: Store, progress: Progress, *, force: bool = False) -> Outcome:
-    """Run one node that has been looked up; arguments and errors as `run_nodes`."""
+def run_node(
+    node: Node, store: Store, progress: Progress, *, force: bool = False, stop: StopSignal | None = None
+) -> Outcome:
+    """Run one node that has been looked up; arguments and errors as `run_nodes`.
+
+    With `stop`, a job's signals are heard there, and an interrupted attempt is continued even with `force`.
+    """
     if node.done and not force:
         store.set_latest(node.kind, node.name, node.done.key)
         progress.message(f"{node.stage.name} {node.done.ref}: up to date")
@@ -104,7 +111,7 @@ def run_node(node: Node, store: Store, progress: Progress, *, force: bool = Fals
     began = time.monotonic()
     reasons = node.reasons or ["it was forced"]
     progress.message(f"{node.stage.name} {node.ref}: running {because(reasons)}")
-    artifact = _execute(node, store, progress, force)
+    artifact = _execute(node, store, progress, force, stop)
     if node.done and node.done.content_digest != artifact.manifest.content_digest:
         change = _first_change(node.done, artifact.manifest)
         progress.message(f"WARNING {artifact.ref}: the forced run gave other bytes than before: {change}")
@@ -119,20 +126,50 @@ def _first_change(old: Manifest, new: Manifest) -> str:
     return f"{len(changed)} of {len(after)} files differ, the first is {changed[0]}" if changed else "same files"
 
 
-def _execute(node: Node, store: Store, progress: Progress, force: bool) -> Artifact:
-    inputs = {slot: store.resolve(manifest.ref) for slot, manifest in node.inputs.items() if manifest}
+def follow_node(node: Node, store: Store, progress: Progress, *, force: bool = False) -> None:
+    """Take part in a node's work as one of several processes; rank 0 runs `run_node` and writes."""
+    if node.done and not force:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Follower(Path(folder), scratch_of(store.staging(node.manifest().ref)))
+        node.stage.run(node.view, _inputs(node, store), draft, progress)
+
+
+@dataclass
+class Follower:
+    """The draft of a process that writes nothing that lasts: what it may read is where rank 0 writes it."""
+
+    path: Path
+    scratch: Path
+    metrics: dict[str, Any] = field(default_factory=dict)
+    seeds: dict[str, int] = field(default_factory=dict)
+
+
+def _inputs(node: Node, store: Store) -> dict[str, Artifact]:
+    return {slot: store.resolve(manifest.ref) for slot, manifest in node.inputs.items() if manifest}
+
+
+def _execute(node: Node, store: Store, progress: Progress, force: bool, stop: StopSignal | None) -> Artifact:
+    inputs = _inputs(node, store)
     manifest = replace(node.manifest(), command=command_line(), git=git_state(), environment=environment())
-    draft = store.begin(manifest, force=force, wait_s=node.config.artifacts.wait)
+    wait_s = node.config.artifacts.wait if stop is None else max(node.config.artifacts.wait, 2 * TERM_S)
+    draft = store.begin(manifest, force=force, resume=stop is not None, wait_s=wait_s)
     try:
-        with stop_on_signals():
+        with stop_on_signals() if stop is None else nullcontext():
             with progress:
                 node.stage.run(node.view, inputs, draft, progress)
             draft.manifest = replace(draft.manifest, environment=environment())
             return draft.publish()
-    except (Interrupted, KeyboardInterrupt) as stop:
+    except (Stopped, KeyboardInterrupt) as reason:
         draft.keep()
-        raise Interrupted(f"{node.stage.name}: interrupted; run the same command again to continue") from stop
+        raise Interrupted(f"{node.stage.name}: interrupted; run the same command again to continue") from reason
     except Exception as error:
+        if stop is not None and stop.requested:  # processes that heard the signal themselves are gone
+            draft.keep()
+            raise Interrupted(f"{node.stage.name}: {_text(error)} while stopping") from error
+        if stop is not None and isinstance(error, BrokenExecutor):
+            draft.keep()
+            raise
         raise _failure(node, draft, error) from error
 
 
@@ -142,7 +179,10 @@ def _failure(node: Node, draft: Draft, error: Exception) -> Exception:
     if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
         draft.keep()
         return StageError(f"{node.stage.name}: no disk space left at {draft.path}; free some and run again to continue")
-    if isinstance(error, (OSError, MemoryError)):
+    if isinstance(error, FileNotFoundError):  # a setting that names no file: trying again would not help
+        draft.keep()
+        return StageError(f"{node.stage.name}: {_text(error)}")
+    if isinstance(error, (OSError, MemoryError, BrokenExecutor)):
         draft.keep()
         return StageError(f"{node.stage.name}: {_text(error)}; finished parts are kept, run again to continue")
     if isinstance(error, ArtifactError):

@@ -9,13 +9,16 @@ from typing import Any
 
 from stages.code import Code, code_of
 from stages.config import Config
-from stages.convert import ConfigError
-from stages.registry import Stage
+from stages.convert import ConfigError, nearest
+from stages.reasons import explain
+from stages.registry import Slot, Stage, load_all
 from wbm.artifacts.digest import digest_value, plain
 from wbm.artifacts.manifest import InputRef, Manifest
-from wbm.artifacts.store import Store
+from wbm.artifacts.reference import is_reference
+from wbm.artifacts.store import KINDS, Store
 
-_MAX_REASONS = 4
+POLICIES = ("student", "teacher", "bundle")  # what can be evaluated
+_LONG = ("assets", "teacher", "rollouts", "student")  # kinds that reference results stand in for in a whole run
 
 
 class SectionView:
@@ -106,7 +109,9 @@ def _code(module: str) -> Code:
     return code_of(module)
 
 
-def build(stages: Sequence[Stage], overrides: Sequence[str], composer: Composer, store: Store) -> list[Node]:
+def build(
+    stages: Sequence[Stage], overrides: Sequence[str], composer: Composer, store: Store, *, reference: bool = False
+) -> list[Node]:
     """All nodes of the pipeline in order, not yet looked up in the store.
 
     Args:
@@ -114,17 +119,41 @@ def build(stages: Sequence[Stage], overrides: Sequence[str], composer: Composer,
         overrides: override lines without sweeps.
         composer: turns override lines into a configuration.
         store: where explicitly named inputs are found.
+        reference: let reference results stand in for what is made by the long stages; what nobody needs then is left
+            out. The last of `stages`, the evaluation and the export are run in any case.
 
     Raises:
         ConfigError: a bad configuration.
         ArtifactError: an input that was named does not exist.
     """
+    nodes = _chain(stages, overrides, composer, store, _LONG if reference else ())
+    if not reference:
+        return nodes
+    return _needed(nodes, [n for n in nodes if n.kind not in _LONG or n.stage.name == stages[-1].name])
+
+
+def _chain(
+    stages: Sequence[Stage], overrides: Sequence[str], composer: Composer, store: Store, stand_in: Sequence[str]
+) -> list[Node]:
     base = composer(overrides)
+    _check_slots(base)
     nodes: list[Node] = []
     for stage in stages:
         for config, extra in _variants(stage, base, overrides, composer):
-            nodes.append(_node(stage, config, (*overrides, *extra), nodes, store))
+            nodes.append(_node(stage, config, (*overrides, *extra), nodes, store, stand_in))
     return nodes
+
+
+def _check_slots(config: Config) -> None:
+    """An input that no stage has is a slip of the pen."""
+    stages = load_all()
+    suites = {stage.kind: getattr(config, stage.each[1]) for stage in stages if stage.each}
+    known: set[str] = set()
+    for slot in (slot for stage in stages for slot in stage.slots):
+        known |= {f"{slot.kind}_{entry}" for entry in suites.get(slot.kind, ())} if slot.every else {slot.name}
+    for name in config.inputs:
+        if name not in known:
+            raise ConfigError(f"+inputs.{name}: no stage has this input{nearest(name, sorted(known))}")
 
 
 def _variants(
@@ -141,7 +170,13 @@ def _variants(
 
 
 def single(
-    stage: Stage, stages: Sequence[Stage], overrides: Sequence[str], composer: Composer, store: Store
+    stage: Stage,
+    stages: Sequence[Stage],
+    overrides: Sequence[str],
+    composer: Composer,
+    store: Store,
+    *,
+    reference: bool = False,
 ) -> list[Node]:
     """Nodes of one stage and of what it needs; the stage's own node is the last.
 
@@ -149,9 +184,10 @@ def single(
     """
     before = list(stages[: [s.name for s in stages].index(stage.name)])
     shared = [line for line in overrides if not _belongs(line, before)]
-    nodes = build(before, shared, composer, store)
-    nodes.append(_node(stage, composer(overrides), tuple(overrides), nodes, store))
-    return _needed(nodes)
+    stand_in = KINDS if reference else ()
+    nodes = _chain(before, shared, composer, store, stand_in)
+    nodes.append(_node(stage, composer(overrides), tuple(overrides), nodes, store, stand_in))
+    return _needed(nodes, nodes[-1:])
 
 
 def _belongs(line: str, stages: Sequence[Stage]) -> bool:
@@ -159,7 +195,7 @@ def _belongs(line: str, stages: Sequence[Stage]) -> bool:
     return any(stage.each and line.lstrip("+").split("=")[0] == stage.each[0] for stage in stages)
 
 
-def _needed(nodes: list[Node]) -> list[Node]:
+def _needed(nodes: list[Node], targets: Sequence[Node]) -> list[Node]:
     wanted: set[int] = set()
 
     def visit(node: Node) -> None:
@@ -168,28 +204,79 @@ def _needed(nodes: list[Node]) -> list[Node]:
             for upstream in node.upstream.values():
                 visit(upstream)
 
-    visit(nodes[-1])
+    for target in targets:
+        visit(target)
     return [node for node in nodes if id(node) in wanted]
 
 
-def _node(stage: Stage, config: Config, overrides: tuple[str, ...], before: list[Node], store: Store) -> Node:
+def _node(
+    stage: Stage,
+    config: Config,
+    overrides: tuple[str, ...],
+    before: list[Node],
+    store: Store,
+    stand_in: Sequence[str],
+) -> Node:
+    """One node, its inputs either fixed to published artifacts or tied to the nodes before it.
+
+    `stand_in` lists the kinds of inputs that are taken from the reference results where they have one.
+    """
+    node = bare_node(stage, config, overrides)
+    asked = {slot.name: _asked(slot, config) for slot in stage.slots}
+    if any(text and is_reference(text) for text in asked.values()):
+        stand_in = KINDS  # the results belong together: a reference policy is judged on the reference scenes
+    for slot in stage.slots:
+        matches = [other for other in before if other.kind == slot.kind]
+        text = asked[slot.name]
+        if text and not slot.every:
+            node.fixed[slot.name] = _named(slot, text, stage, store)
+            continue
+        for other in matches:
+            name = other.ref if slot.every else slot.name
+            own = config.inputs.get(name.replace("/", "_")) if slot.every else None
+            found = store.references.of_kind(slot.kind, other.name if slot.every else None)
+            if own:
+                node.fixed[name] = _named(slot, own, stage, store)
+            elif found and slot.kind in stand_in:
+                node.fixed[name] = found.manifest
+            else:
+                node.upstream[name] = other
+        if not matches:
+            raise ConfigError(
+                f"{stage.name}: no stage makes its input '{slot.name}'; set +inputs.{slot.name}=KIND/NAME"
+            )
+    return node
+
+
+def bare_node(
+    stage: Stage,
+    config: Config,
+    overrides: Sequence[str] = (),
+    code: Code | None = None,
+    name: str | None = None,
+) -> Node:
+    """A node without its inputs; `name` in place of the stage's own name for its artifact."""
     sections = {name: plain(getattr(config, name), key_only=True) for name in stage.sections}
     view = SectionView(config, stage)
     if outside := stage.outside(view):
         sections["outside"] = outside
-    name = stage.artifact_name(view)
-    node = Node(stage, config, overrides, stage.kind, name, _code(stage.module), sections)
-    for slot in stage.slots:
-        text = config.inputs.get(slot.name) or (getattr(config, slot.name, None) if slot.name == "policy" else None)
-        if text:
-            node.fixed[slot.name] = store.manifest(text)
-            continue
-        matches = [other for other in before if other.kind == slot.kind]
-        for other in matches:
-            node.upstream[other.ref if slot.every else slot.name] = other
-        if not matches:
-            raise ConfigError(f"{stage.name}: no stage makes its input '{slot.name}'; set inputs.{slot.name}=KIND/NAME")
-    return node
+    name = name or stage.artifact_name(view)
+    return Node(stage, config, tuple(overrides), stage.kind, name, code or _code(stage.module), sections)
+
+
+def _asked(slot: Slot, config: Config) -> str | None:
+    """The artifact that the settings name for a slot; `policy` is meant for whatever takes a student."""
+    return config.inputs.get(slot.name) or (config.policy if slot.kind == "student" else None)
+
+
+def _named(slot: Slot, text: str, stage: Stage, store: Store) -> Manifest:
+    allowed = POLICIES if slot.name == "policy" else (slot.kind,)
+    manifest = store.manifest(text, (slot.kind,))
+    if manifest.kind not in allowed:
+        hint = "" if slot.name == "policy" or slot.kind != "student" else "; to evaluate it alone, call wbm evaluate"
+        takes = " or ".join(allowed)
+        raise ConfigError(f"{stage.name}: {text} is of kind {manifest.kind}, this input takes {takes}{hint}")
+    return manifest
 
 
 def compute_key(node: Node) -> str:
@@ -213,67 +300,16 @@ def look_up(node: Node, store: Store, *, use_latest: bool = False) -> None:
     missing = [slot for slot, manifest in node.inputs.items() if manifest is None]
     if missing:
         node.key, node.done = None, None
-        node.reasons = explain(node, store.latest(node.kind, node.name), missing)
+        node.reasons = _explain(node, store, missing)
         return
     node.key = compute_key(node)
     node.done = store.find(node.kind, node.name, node.key)
-    node.reasons = [] if node.done else explain(node, store.latest(node.kind, node.name), [])
+    node.reasons = [] if node.done else _explain(node, store, [])
 
 
-def explain(node: Node, old: Manifest | None, missing: Sequence[str]) -> list[str]:
-    """Why `old`, the newest artifact of this name, does not do."""
-    if old is None:
-        return ["nothing published yet"]
-    reasons = diff_values(old.config, node.sections)
-    reasons += [f"code of {path} {what}" for path, what in _changes(old.code, node.code.files)]
-    reasons += [f"{name} {old.versions.get(name, 'absent')} -> {node.code.versions.get(name, 'absent')}"
-                for name, _ in _changes(old.versions, node.code.versions)]  # fmt: skip
-    for slot in sorted(set(old.inputs) | set(node.inputs)):
-        new = node.inputs.get(slot)
-        if slot in missing:
-            reasons.append(f"input {slot} changed")
-        elif slot not in node.inputs:
-            reasons.append(f"input {slot} is no longer used")
-        elif slot not in old.inputs:
-            reasons.append(f"input {slot} is new")
-        elif new and new.content_digest != old.inputs[slot].content_digest:
-            reasons.append(f"input {slot} changed")
-    return reasons or ["the newest artifact was made by another stage"]
-
-
-def _changes(old: dict[str, str], new: dict[str, str]) -> list[tuple[str, str]]:
-    out = []
-    for name in sorted(old.keys() | new.keys()):
-        if old.get(name) != new.get(name):
-            out.append((name, "changed" if name in old and name in new else "added" if name in new else "removed"))
-    return out
-
-
-def diff_values(old: Any, new: Any, where: str = "") -> list[str]:
-    """Differences of two trees of plain values as `key old -> new`."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        out = []
-        for name in sorted(old.keys() | new.keys()):
-            path = f"{where}.{name}" if where else name
-            if name not in old or name not in new:
-                side = f"absent -> {_show(new[name])}" if name in new else f"{_show(old[name])} -> absent"
-                out.append(f"{path} {side}")
-            else:
-                out += diff_values(old[name], new[name], path)
-        return out
-    return [] if old == new else [f"{where} {_show(old)} -> {_show(new)}"]
-
-
-def _show(value: Any) -> str:
-    text = "null" if value is None else str(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def because(reasons: Sequence[str]) -> str:
-    """Reasons in one line."""
-    more = len(reasons) - _MAX_REASONS
-    shown = [f"because {reason}" for reason in reasons[:_MAX_REASONS]]
-    return ", ".join(shown) + (f", and {more} more" if more > 0 else "")
+def _explain(node: Node, store: Store, missing: Sequence[str]) -> list[str]:
+    newest = store.latest(node.kind, node.name)
+    return explain(newest, node.sections, node.code, node.inputs, missing)
 
 
 def plan(nodes: Sequence[Node], store: Store) -> list[Node]:

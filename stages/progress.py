@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
+
+from wbm.launch.stop import Stopped
 
 T = TypeVar("T")
 
@@ -39,9 +41,13 @@ class Progress:
     """Bars for the work of a stage; silent when `enabled` is false.
 
     On a terminal the bars move; in a log, each message is one line.
+
+    Attributes:
+        stopping: whether the scheduler asked the run to stop at its next safe point.
     """
 
     def __init__(self, enabled: bool = True) -> None:
+        self.stopping: Callable[[], bool] = lambda: False
         self._enabled = enabled
         self._bars: Any = None
 
@@ -82,6 +88,15 @@ class Progress:
             for item in iterable:
                 yield item
                 task.update()
+
+    def safe_point(self) -> None:
+        """A stage calls this where all that it has done is on disk.
+
+        Raises:
+            Stopped: the run was asked to stop.
+        """
+        if self.stopping():
+            raise Stopped("asked to stop")
 
     def message(self, text: str) -> None:
         """Print a line on standard error, above the bars."""

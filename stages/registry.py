@@ -11,15 +11,24 @@ A stage module is light to import (torch, warp and mujoco are imported inside `r
                                  optional: digests, by name, of what it reads outside the store; they join the key
     EACH: tuple[str, str]        optional: ("teacher", "teachers") makes `wbm run` run the stage once for each ENTRY of
                                  `teachers`, with the override `teacher=ENTRY`
+
+and, for clusters, optionally
+
+    def uses_gpu(cfg) -> bool    whether a GPU helps under this configuration
+    RANKED = True                several processes can run it together (torch.distributed)
+    def parts(cfg) -> int        into how many parts the work falls; jobs on different nodes make them with
+    def make_parts(cfg, inputs, places, workers) -> Iterator[int]    which makes part k in the folder `places[k]` and
+                                 yields k; `run` finds it as the folder PARTS/k below `draft.path`
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+PARTS = "parts"
 MODULES: dict[str, str] = {
     "prepare-assets": "stages.prepare_assets",
     "train-teacher": "stages.train_teacher",
@@ -28,6 +37,8 @@ MODULES: dict[str, str] = {
     "evaluate": "stages.evaluate",
     "deploy-export": "stages.deploy_export",
 }
+# Stages beside the pipeline: `wbm evaluate --figure4` runs them.
+FIGURE4: dict[str, str] = {"figure4-run": "stages.figure4_run", "figure4": "stages.figure4"}
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,10 @@ class Stage:
     artifact_name: Callable[[Any], str]
     run: Callable[..., None]
     each: tuple[str, str] | None
+    uses_gpu: Callable[[Any], bool] = lambda cfg: False
+    ranked: bool = False
+    parts: Callable[[Any], int] | None = None
+    make_parts: Callable[..., Iterator[int]] | None = None
     outside: Callable[[Any], dict[str, str]] = lambda cfg: {}
 
 
@@ -68,16 +83,21 @@ def load(name: str) -> Stage:
         KeyError: no such stage.
         AttributeError: the module does not define what a stage must.
     """
-    module = importlib.import_module(MODULES[name])
+    where = (MODULES | FIGURE4)[name]
+    module = importlib.import_module(where)
     return Stage(
         name=name,
-        module=MODULES[name],
+        module=where,
         kind=module.KIND,
         sections=tuple(module.SECTIONS),
         slots=tuple(slot(text) for text in module.INPUTS),
         artifact_name=module.name,
         run=module.run,
         each=getattr(module, "EACH", None),
+        uses_gpu=getattr(module, "uses_gpu", Stage.uses_gpu),
+        ranked=getattr(module, "RANKED", False),
+        parts=getattr(module, "parts", None),
+        make_parts=getattr(module, "make_parts", None),
         outside=getattr(module, "outside", Stage.outside),
     )
 

@@ -8,11 +8,17 @@ KIND = "teacher"
 SECTIONS = ("seed", "robot", "sim", "wbc", "env", "teacher", "ppo")
 INPUTS = ("assets",)
 EACH = ("teacher", "teachers")
+RANKED = True
 
 
 def name(cfg: Any) -> str:
     """Artifacts are named after the teacher."""
     return cfg.teacher.name
+
+
+def uses_gpu(cfg: Any) -> bool:
+    """The physics engine decides."""
+    return cfg.sim.engine == "mujoco_warp"
 
 
 def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
@@ -54,8 +60,11 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
 
         def report(p: Progress) -> None:
             nonlocal shown
+            if shown == 0 and p.iteration > 1:
+                progress.message(f"  going on after iteration {p.iteration - 1}")
             task.update(p.iteration - shown, reward=p.reward, success=p.success, evaluation=p.evaluation)
             shown = p.iteration
+            progress.safe_point()
             if p.iteration % teacher.eval_every == 0:
                 progress.message(
                     f"  iteration {p.iteration}/{p.iterations}: success {p.success:.2f}, "

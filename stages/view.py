@@ -8,12 +8,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from wbm.artifacts.errors import Missing
+
 if TYPE_CHECKING:
+    from wbm.artifacts.manifest import Artifact, Manifest
+    from wbm.artifacts.store import Store
     from wbm.report.viewer import Shown
     from wbm.robot.model import RobotModel
 
 ROBOT = "robot"
 _EPISODE_FOLDERS = ("shards", "episodes")
+_VIEWABLE = ("evaluation", "rollouts", "assets")  # what `wbm view reference` looks for, in this order
 _MAX_SHOWN = 200
 
 
@@ -35,10 +40,8 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         robot = load_robot(composer([item for item in items if "=" in item]).robot.facts)
         shown = robot_items(robot)
     else:
-        artifact = store.resolve(names[0])
-        world = next(
-            (store.resolve(r.ref) for r in artifact.manifest.inputs.values() if r.ref.startswith("assets/")), None
-        )
+        artifact = store.resolve(names[0], _VIEWABLE)
+        world = _assets_of(artifact.manifest, store)
         shown = items_of(artifact.path, artifact.manifest.kind, world.path if world else None)
         made_for = artifact if artifact.manifest.kind == "assets" else world
         robot = robot_of(made_for.path) if made_for else load_robot()
@@ -51,6 +54,16 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         return
     finally:
         viewer.close()
+
+
+def _assets_of(manifest: Manifest, store: Store) -> Artifact | None:
+    """The assets that an artifact was made with; None when they are gone."""
+    for ref in (r.ref for r in manifest.inputs.values() if r.ref.startswith("assets/")):
+        try:
+            return store.resolve(ref)
+        except Missing:
+            sys.stderr.write(f"{ref} is not here any more: supports and other objects are not drawn\n")
+    return None
 
 
 def robot_items(robot: RobotModel | None = None) -> list[Shown]:

@@ -3,7 +3,6 @@
 import json
 import os
 import random
-import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -200,36 +199,6 @@ def test_completion_offers_commands_options_groups_keys_and_values():
     assert complete("completion", "f") == ["fish"]
 
 
-def shell_answers(shell, script):
-    if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
-    return subprocess.run([shell, "-c", script], env=ENV, capture_output=True, text=True, timeout=60).stdout.split()
-
-
-def test_bash_completes_after_an_equals_sign(tmp_path):
-    """Bash takes `=` for the end of a word: the reply must not repeat what stands before it."""
-    program = tmp_path / "wbm"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m stages.cli "$@"\n')
-    program.chmod(0o755)
-    script = f"PATH={tmp_path}:$PATH\n{completion.SCRIPTS['bash']}\n"
-    line = "wbm run profile=la"
-    script += f"COMP_LINE='{line}' COMP_POINT={len(line)} COMP_WORDS=(wbm run profile = la) COMP_CWORD=4\n_wbm\n"
-    assert shell_answers("bash", script + 'echo "${COMPREPLY[@]}"') == ["laptop"]
-    script = script.replace(f"COMP_LINE='{line}'", "COMP_LINE='wbm dist'").replace(
-        f"COMP_POINT={len(line)}", "COMP_POINT=8"
-    )
-    script = script.replace("COMP_WORDS=(wbm run profile = la) COMP_CWORD=4", "COMP_WORDS=(wbm dist) COMP_CWORD=1")
-    assert shell_answers("bash", script + 'echo "${COMPREPLY[@]}"') == ["distill"]
-
-
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_other_shells_accept_the_script(shell, tmp_path):
-    path = tmp_path / "script"
-    path.write_text(completion.SCRIPTS[shell])
-    shell_answers(shell, "true")
-    assert subprocess.run([shell, "-n", path]).returncode == 0
-
-
 @pytest.fixture
 def package(tmp_path):
     """A package `p`: stage -> library -> kernel, a data file, and a module that nobody imports."""
@@ -279,3 +248,8 @@ def test_worker_counts_and_notes_are_no_part_of_a_key():
     few, many = (compose.compose([f"rollouts.workers={n}"]).config.rollouts for n in (1, 4))
     assert few != many
     assert plain(few, key_only=True) == plain(many, key_only=True)
+
+
+def test_an_entry_of_a_mapping_needs_no_plus_sign():
+    for line in ("inputs.assets=assets/mine", "+inputs.assets=assets/mine"):
+        assert compose.compose([line]).config.inputs == {"assets": "assets/mine"}

@@ -45,7 +45,7 @@ def bundle(tmp_path_factory):
 
 def test_runtime_sees_what_the_environment_saw(bundle):
     torch = pytest.importorskip("torch")
-    from stages.runtime_driver import RuntimeDriver
+    from wbm.learning.runtime_driver import RuntimeDriver
 
     driver, robot = RuntimeDriver(bundle, N), load_robot()
     q = np.tile(robot.q_home, (N, 1))
@@ -65,7 +65,7 @@ def test_runtime_sees_what_the_environment_saw(bundle):
         for name, values in runtime.observation.items():
             np.testing.assert_allclose(values, obs[name][i], atol=2e-6, err_msg=name)  # float32 clouds there and back
     action = forward(obs, weights())
-    wished = to_target(q, action, SCHEMA.action)
+    wished = to_target(np, q, action, SCHEMA.action)
     c = bundle.contract
     # From rest the filter allows qdd_max dt^2 in the first step; where less is wished, nothing is changed.
     room = np.minimum(c.qdd_max * c.dt**2, c.qd_max * c.dt)
@@ -75,7 +75,7 @@ def test_runtime_sees_what_the_environment_saw(bundle):
 
 def test_a_refusal_holds_and_a_new_episode_starts_anew(bundle):
     pytest.importorskip("torch")
-    from stages.runtime_driver import RuntimeDriver
+    from wbm.learning.runtime_driver import RuntimeDriver
 
     driver, q = RuntimeDriver(bundle, N), np.tile(load_robot().q_home, (N, 1))
     qd, previous = np.zeros((N, 32)), np.zeros((N, 32), np.float32)
@@ -90,8 +90,8 @@ def test_a_refusal_holds_and_a_new_episode_starts_anew(bundle):
         if step == 3:
             np.testing.assert_array_equal(targets[1], before[1])
             assert (targets[0] != before[0]).any()
-    assert driver.refusals == {"not-finite": 1}
+    assert driver.refusals == {1: {"not-finite": 1}}
     driver.targets(q, qd, world(0, q, previous), episode + N, np.zeros(N))
     for runtime in driver._runtimes:
         assert not runtime.observation["prev_action"].any()
-    assert driver.refusals == {"not-finite": 1}
+    assert driver.refusals == {1: {"not-finite": 1}}

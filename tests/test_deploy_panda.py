@@ -21,15 +21,17 @@ from wbm.deploy.config import DeployConfig
 from wbm.deploy.contract import make_contract
 from wbm.deploy.faults import Fault, Refused
 from wbm.deploy.loop import run_loop
-from wbm.deploy.panda import FR3_RANGE, PandaArm, PandaDriver
+from wbm.deploy.panda import PandaArm, PandaDriver
 from wbm.deploy.panda_stream import CYCLE, SMOOTHING_S, Follower
 from wbm.deploy.runtime import PolicyRuntime
 from wbm.robot import joints
 from wbm.robot.model import RobotModel, load_robot
+from wbm.robot.schema import PROPRIO_LABELS
 
 ROOT = Path(__file__).resolve().parent.parent
 START = np.array([0.0, 0.0, 0.0, -1.57, 0.0, 1.57, 0.785])  # where the server's arm stands
 ATTEMPTS = 5
+LEAD_IN, REST = 75, 25  # steps from START to the first pose of the episode, and at its last
 PYTHON = Path(os.environ.get("WBM_FRANKA_PYTHON", ROOT / ".venv-franka" / "bin" / "python"))
 
 
@@ -125,9 +127,12 @@ def arm_mjcf(robot: RobotModel) -> str:
 
 
 def _hurry() -> None:
-    """The server must keep 1 kHz beside whatever else runs here."""
+    """The server must keep 1 kHz beside whatever else runs here; on a single core its physics would starve at FIFO."""
     with suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+        if len(os.sched_getaffinity(0)) > 1:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+        else:
+            os.nice(-15)
 
 
 @pytest.fixture(scope="module")
@@ -177,9 +182,31 @@ class RestOfRobot(FakeRobot):
         return replace(reading, stamps=dict.fromkeys(reading.stamps, now))
 
 
+class Recorded:
+    """In a network's place: the arm's joints of a recorded rollout, after a smooth way there from `START`.
+
+    `arm_episode.npy` holds the seven arm columns of `proprio` of one smoke-profile rollout, 25 steps a second.
+    """
+
+    def __init__(self) -> None:
+        episode = np.load(ROOT / "tests" / "data" / "arm_episode.npy").astype(np.float64)
+        share = (1 - np.cos(np.linspace(0, np.pi, LEAD_IN)))[:, None] / 2
+        lead_in, rest = START + share * (episode[0] - START), np.repeat(episode[-1:], REST, axis=0)
+        self.path = np.concatenate([lead_in, episode, rest])
+        self.step = 0
+        self._columns = [PROPRIO_LABELS.index(f"q/{joints.JOINT_NAMES[i]}") for i in range(32)[joints.ARM]]
+
+    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        action = np.zeros((1, 32), np.float32)
+        wish = self.path[min(self.step, len(self.path) - 1)] - observation["proprio"][0, self._columns]
+        action[0, joints.ARM] = wish / np.array(SCHEMA.action.scale)[joints.ARM]
+        self.step += 1
+        return action
+
+
 @pytest.mark.slow
-def test_arm_follows_an_episode_without_a_reflex(server, tmp_path):
-    """A policy's targets through the safety filter to a server that aborts on any broken motion limit."""
+def test_arm_follows_a_recorded_episode_without_a_reflex(server, tmp_path):
+    """A rollout's arm through the safety filter to a server that aborts on any broken motion limit."""
     robot = load_robot()
     robot = replace(robot, q_home=np.r_[robot.q_home[:3], START, robot.q_home[10:]])
     # On a busy machine the server falls behind real time: its arm then moves less than its velocity says.
@@ -195,23 +222,29 @@ def test_arm_follows_an_episode_without_a_reflex(server, tmp_path):
 
 
 def _follow(contract, bundle) -> bool:
-    """Run 6 s of policy on the arm; False when the arm stopped because commands came late, which says nothing of us."""
-    rest = RestOfRobot()
+    """Play the episode on the arm; False when the arm stopped because commands came late, which says nothing of us."""
+    rest, recorded, runtime = RestOfRobot(), Recorded(), PolicyRuntime(bundle)
+    runtime._policy = recorded
     arm = PandaArm("127.0.0.1", contract, PYTHON, model="fr3")
     try:
         start = arm.state().q
-        report = run_loop(PandaDriver(arm, rest), PolicyRuntime(bundle), 150)
+        recorded.path[:LEAD_IN] += (start - START) * np.linspace(1, 0, LEAD_IN)[
+            :, None
+        ]  # where it stands after a retry
+        report = run_loop(PandaDriver(arm, rest), runtime, len(recorded.path))
         if report.refusals and arm.worst_success_rate < 1.0:
             return False
-        assert not report.refusals and report.steps == 150, report.refusals
+        assert not report.refusals and report.steps == len(recorded.path), report.refusals
         aimed = rest.commands[-1].q_target[joints.ARM]
-        inside = np.clip(aimed, FR3_RANGE[:, 0] + 0.05, FR3_RANGE[:, 1] - 0.05)  # an FR3's range is not a Panda's
         for _ in range(100):
             time.sleep(0.1)
-            if np.abs(arm.state().q - inside).max() < 0.03:
+            if np.abs(arm.state().q - aimed).max() < 0.05:
                 break
-        np.testing.assert_allclose(arm.state().q, inside, atol=0.03)  # the server's servo has a finite stiffness
-        assert np.abs(inside - start).max() > 0.05
+        else:
+            if arm.worst_success_rate < 1.0:  # the server's physics is far behind its clock
+                return False
+        np.testing.assert_allclose(arm.state().q, aimed, atol=0.05)  # the server's servo has a finite stiffness
+        np.testing.assert_allclose(aimed, recorded.path[-1], atol=0.05)
         return True
     except Refused as refused:
         if arm.worst_success_rate < 1.0:

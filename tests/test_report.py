@@ -14,9 +14,10 @@ from report_synthetic import make_result, picture
 from scipy.stats import binomtest
 
 from wbm.report.config import EvaluationConfig
-from wbm.report.page import percent, write_page
+from wbm.report.films import choose_strips
+from wbm.report.page import write_page
 from wbm.report.plots import curves_figure, failure_figure, figure4, to_png, to_svg
-from wbm.report.stats import overlap, summarise, wilson
+from wbm.report.stats import overlap, percent, summarise, wilson
 from wbm.report.video import film_frame, follow_camera, key_steps, look_at, write_mp4
 from wbm.robot.proprio import quat_to_mat
 
@@ -148,7 +149,7 @@ def test_film_frame_asks_the_renderer_for_both_views():
     )
     assert asked == [("scene", 3, 240, 180, 42.0), ("scene", 3, 80, 60, 58.0)]
     assert outer.shape == (180, 240, 3) and own.shape == (60, 80, 3)
-    assert outer[40, 190, 0] == 20 and outer[150, 20, 0] == 10  # the inset lies in the upper right corner
+    assert outer[140, 190, 0] == 20 and outer[40, 190, 0] == 10  # the inset lies in the lower right corner
 
 
 def test_key_steps_are_in_order():
@@ -159,6 +160,13 @@ def test_key_steps_are_in_order():
     assert list(steps.values()) == [20, 50, 67, 78, 99]
     never = key_steps(np.ones(10, bool), np.zeros(10, bool), np.zeros(10, bool))
     assert list(never.values()) == sorted(never.values())
+
+
+def test_strips_show_successes_first_and_near_misses_next():
+    kinds = [(False, None), (False, 3.0), (True, 4.0), (False, 2.0), (True, 5.0)]
+    records = [{"success": s, "time_to_grasp_s": t} for s, t in kinds]
+    assert choose_strips(records, 1) == [2] and choose_strips(records, 3) == [1, 2, 4]
+    assert choose_strips(records, 9) == [0, 1, 2, 3, 4] and choose_strips([], 2) == []
 
 
 def test_page_stands_alone(tmp_path):

@@ -97,6 +97,6 @@ def test_settings_are_checked() -> None:
     for bad in ({"grasp": "pinch"}, {"num_envs": 0}, {"patience": -1}):
         with pytest.raises(ValueError, match=r"^teacher\."):
             TeacherConfig(**bad)
-    for bad in ({"schedule": "linear"}, {"gamma": 0.0}, {"lr": -1.0}):
+    for bad in ({"schedule": "cosine"}, {"gamma": 0.0}, {"lr": -1.0}):
         with pytest.raises(ValueError, match=r"^ppo\."):
             PpoConfig(**bad)

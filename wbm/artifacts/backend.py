@@ -168,15 +168,7 @@ class LocalBackend:
             if target.exists():
                 if not replace:
                     raise Conflict(f"{ref}: published by another process meanwhile")
-                try:
-                    exchange(staged, target)
-                except OSError as error:
-                    if error.errno not in (errno.ENOSYS, errno.EINVAL):
-                        raise
-                    aside = target.with_name(f".{target.name}.replaced")
-                    os.rename(target, aside)
-                    os.rename(staged, target)
-                    os.rename(aside, staged)
+                swap(staged, target)
             else:
                 _rename(staged, target)
             fsync_path(target.parent)
@@ -217,6 +209,19 @@ class LocalBackend:
         for folder in doomed:
             shutil.rmtree(folder)
         return freed
+
+
+def swap(left: Path, right: Path) -> None:
+    """Exchange two folders, in one step where the file system can."""
+    try:
+        exchange(left, right)
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.EINVAL):
+            raise
+        aside = right.with_name(f".{right.name}.replaced")
+        os.rename(right, aside)
+        os.rename(left, right)
+        os.rename(aside, left)
 
 
 def _rename(staged: Path, target: Path) -> None:

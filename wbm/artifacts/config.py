@@ -12,10 +12,12 @@ class ArtifactsConfig:
     Attributes:
         root: directory (relative to the working directory) or `s3://bucket/prefix`.
         wait: seconds to wait for another process that writes the same artifact.
+        reference: folder of the reference results; default: those that come with wbm.
     """
 
     root: str = "artifacts"
     wait: float = 0.0
+    reference: str | None = None
 
     def __post_init__(self) -> None:
         if not self.root:

@@ -177,3 +177,8 @@ def is_live(backend: Backend, path: str) -> bool:
     found = backend.read(path)
     holder = _Record.parse(found[0]).holder if found else None
     return holder is not None and not holder.known_dead()
+
+
+def is_held(backend: Backend, ref: str) -> bool:
+    """Whether a living process writes the artifact `ref` or one of its shards."""
+    return any(is_live(backend, path) for path in (f"leases/{ref}", *backend.records(f"leases/{ref}.shards")))

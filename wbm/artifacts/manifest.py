@@ -62,6 +62,7 @@ class Manifest:
     metrics: dict[str, Any] = field(default_factory=dict)
     content_digest: str = ""
     files: tuple[FileEntry, ...] = ()
+    trimmed: dict[str, Any] = field(default_factory=dict)  # a reference result that lacks files of its original
     schema_version: int = SCHEMA_VERSION
 
     @property
@@ -81,6 +82,19 @@ class Manifest:
         record["files"] = [[e.path, e.size, e.digest, e.content] for e in self.files]
         body = canonical_json(record)
         return body + b"\n" + digest_bytes(body).encode() + b"\n"
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A published artifact: a folder that nobody writes any more, and its manifest."""
+
+    path: Path
+    manifest: Manifest
+
+    @property
+    def ref(self) -> str:
+        """`kind/name/key12`."""
+        return self.manifest.ref
 
 
 def parse_manifest(data: bytes, where: str) -> Manifest:

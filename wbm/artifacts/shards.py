@@ -46,7 +46,7 @@ class Shard:
 
 
 @contextmanager
-def claim_shard(store: Store, ref: str, folder: Path, name: str) -> Iterator[Shard | None]:
+def claim_shard(store: Store, ref: str, folder: Path, name: str, *, wait_s: float = 0.0) -> Iterator[Shard | None]:
     """Take a shard for this process; None when it is finished.
 
     Args:
@@ -54,6 +54,7 @@ def claim_shard(store: Store, ref: str, folder: Path, name: str) -> Iterator[Sha
         ref: the artifact in the making, `kind/name/key12`.
         folder: where its shards are, below the draft's `path`.
         name: the shard's name.
+        wait_s: how long to wait for a writer that may be alive elsewhere.
 
     Raises:
         Conflict: another living process writes it.
@@ -62,7 +63,7 @@ def claim_shard(store: Store, ref: str, folder: Path, name: str) -> Iterator[Sha
     if final.is_dir():
         yield None
         return
-    lease = acquire(store.backend, f"leases/{ref}.shards/{name}")
+    lease = acquire(store.backend, f"leases/{ref}.shards/{name}", wait_s=wait_s)
     try:
         if final.is_dir():  # finished between the look and the lease
             yield None

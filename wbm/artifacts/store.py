@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,24 +16,12 @@ from wbm.artifacts.backend import ABSENT, Backend, LocalBackend
 from wbm.artifacts.digest import KEY_LENGTH
 from wbm.artifacts.errors import ArtifactError, Conflict, Missing
 from wbm.artifacts.files import fsync_path, make_dirs, remove_tree
-from wbm.artifacts.lease import Lease, acquire, is_live
-from wbm.artifacts.manifest import MANIFEST, NAME, Manifest, check_files, parse_manifest, read_manifest, seal
+from wbm.artifacts.lease import Lease, acquire, is_held, is_live
+from wbm.artifacts.manifest import MANIFEST, NAME, Artifact, Manifest, check_files, parse_manifest, seal
+from wbm.artifacts.reference import References, is_reference
 
 KINDS = ("assets", "teacher", "rollouts", "student", "evaluation", "bundle")
 _RETRIES = 1000
-
-
-@dataclass(frozen=True)
-class Artifact:
-    """A published artifact: a folder that nobody writes any more, and its manifest."""
-
-    path: Path
-    manifest: Manifest
-
-    @property
-    def ref(self) -> str:
-        """`kind/name/key12`."""
-        return self.manifest.ref
 
 
 @dataclass
@@ -94,12 +82,17 @@ class Draft:
         return target
 
 
+def scratch_of(staging: Path) -> Path:
+    """The folder for checkpoints that belongs to a staging folder."""
+    return staging.with_name(staging.name + ".scratch")
+
+
 class Store:
     """Artifacts under one root."""
 
     def __init__(self, backend: Backend, reference: Path | None = None) -> None:
         self.backend = backend
-        self.reference = reference or backend.work / "reference"
+        self.references = References(reference or backend.work / "reference")
 
     @classmethod
     def open(cls, url: str | os.PathLike[str], reference: Path | None = None) -> Store:
@@ -123,28 +116,41 @@ class Store:
         """`kind/name/key12` of all published artifacts, or those of one kind, sorted."""
         return [ref for ref in self.backend.artifacts() if kind is None or ref.startswith(f"{kind}/")]
 
-    def manifest(self, text: str) -> Manifest:
+    def manifest(self, text: str, kinds: Sequence[str] = ()) -> Manifest:
         """Manifest of a published artifact without fetching its files; arguments and errors as `resolve`."""
-        if text.startswith("reference/"):
-            return self.resolve(text).manifest
-        ref = self._expand(text)
-        return parse_manifest(self.backend.read_manifest(ref), ref)
+        found = self._find(text, kinds)
+        return (
+            found.manifest if isinstance(found, Artifact) else parse_manifest(self.backend.read_manifest(found), found)
+        )
 
-    def resolve(self, text: str) -> Artifact:
-        """Find `kind/name[/key|/latest]`, `reference/<name>`, or a unique `kind`.
+    def resolve(self, text: str, kinds: Sequence[str] = ()) -> Artifact:
+        """Find `kind/name[/key|/latest]`, a unique `kind`, `reference/<name>`, or `reference`.
+
+        Args:
+            text: a name; with a key it may be that of a reference result too.
+            kinds: what bare `reference` stands for: the main result of the first of these kinds that there is.
 
         Raises:
             Missing: no such artifact; the message names near ones.
             ArtifactError: the manifest is damaged.
         """
-        if text.startswith("reference/"):
-            folder = self.reference / text.removeprefix("reference/")
-            if not (folder / MANIFEST).is_file() or self.reference not in folder.resolve().parents:
-                raise Missing(f"{text}: no such reference result in {self.reference}")
-            return Artifact(folder, read_manifest(folder))
-        ref = self._expand(text)
-        manifest = parse_manifest(self.backend.read_manifest(ref), ref)
-        return Artifact(self.backend.fetch(ref), manifest)
+        found = self._find(text, kinds)
+        if isinstance(found, Artifact):
+            return found
+        manifest = parse_manifest(self.backend.read_manifest(found), found)
+        return Artifact(self.backend.fetch(found), manifest)
+
+    def _find(self, text: str, kinds: Sequence[str]) -> Artifact | str:
+        """A reference result, or the full name of an artifact of the store."""
+        if is_reference(text):
+            return self.references.get(text, kinds)
+        try:
+            return self._expand(text)
+        except Missing:
+            found = self.references.with_ref(text)
+            if found is None:
+                raise
+            return found
 
     def find(self, kind: str, name: str, key: str) -> Manifest | None:
         """Manifest of the artifact with exactly this key, None when it is not published."""
@@ -178,12 +184,22 @@ class Store:
                 continue
         raise Conflict(f"{path}: other processes keep changing it; try again")
 
-    def begin(self, manifest: Manifest, *, force: bool = False, wait_s: float = 0.0) -> Draft:
+    def staging(self, ref: str) -> Path:
+        """Where an artifact is written before it is published."""
+        return self.backend.work / ".staging" / ref
+
+    def forget(self, ref: str) -> None:
+        """Delete what an interrupted attempt left."""
+        shutil.rmtree(self.staging(ref), ignore_errors=True)
+        shutil.rmtree(scratch_of(self.staging(ref)), ignore_errors=True)
+
+    def begin(self, manifest: Manifest, *, force: bool = False, resume: bool = False, wait_s: float = 0.0) -> Draft:
         """Start, or resume, the artifact with `manifest.key`.
 
         Args:
             manifest: kind, name, key and what else is known before the stage runs.
             force: forget an interrupted attempt and replace an artifact with this key.
+            resume: continue an interrupted attempt even so.
             wait_s: how long to wait for another process that writes the same artifact.
 
         Raises:
@@ -194,8 +210,8 @@ class Store:
             raise ArtifactError(
                 f"{manifest.kind}/{manifest.name}: names hold letters, digits, dot, dash and underscore"
             )
-        staging = self.backend.work / ".staging" / manifest.ref
-        scratch = staging.with_name(staging.name + ".scratch")
+        staging = self.staging(manifest.ref)
+        scratch = scratch_of(staging)
         try:
             lease = acquire(self.backend, f"leases/{manifest.ref}", wait_s=wait_s)
         except OSError as error:
@@ -205,9 +221,8 @@ class Store:
         try:
             if self.backend.has(manifest.ref) and not force:
                 raise Conflict(f"{manifest.ref}: already published")
-            if force:
-                shutil.rmtree(staging, ignore_errors=True)
-                shutil.rmtree(scratch, ignore_errors=True)
+            if force and not resume:
+                self.forget(manifest.ref)
             make_dirs(staging)
             (staging / MANIFEST).unlink(missing_ok=True)
             make_dirs(scratch)
@@ -233,8 +248,8 @@ class Store:
         problems = [] if refs is not None else self.dangling()
         for ref in self.names() if refs is None else refs:
             try:
-                if ref.startswith("reference/"):
-                    artifact = self.resolve(ref)
+                if is_reference(ref):
+                    artifact = self.references.get(ref)
                     problems += check_files(artifact.manifest, artifact.path)
                     continue
                 name = self._expand(ref)
@@ -303,7 +318,7 @@ class Store:
             for path in sorted((self.backend.work / area).glob("*/*/*")):
                 ref = path.relative_to(self.backend.work / area).as_posix().removesuffix(".scratch")
                 idle = time.time() - max(path.stat().st_mtime, path.stat().st_ctime)
-                if idle >= grace_s and not (area == ".staging" and is_live(self.backend, f"leases/{ref}")):
+                if idle >= grace_s and not (area == ".staging" and is_held(self.backend, ref)):
                     found.append(path)
         return found
 

@@ -11,7 +11,10 @@ INTEGRATE = ("target", "measured")
 
 @dataclass(frozen=True)
 class WbcWeights:
-    """Weights of the objectives in (1); velocities are m/s or rad/s, so all are comparable."""
+    """Weights of the objectives in (1); velocities are m/s or rad/s, so all are comparable.
+
+    `look` turns the neck and `face` the base towards what the gaze rows alone would not find; `paper` has neither.
+    """
 
     ee_position: float = 10.0
     ee_rotation: float = 2.0
@@ -24,6 +27,7 @@ class WbcWeights:
     smoothness: float = 0.3
     damping: float = 0.01
     look: float = 1.0
+    face: float = 1.0
     collision: float = 0.02
 
     def __post_init__(self) -> None:

@@ -23,7 +23,7 @@ from wbm.kernels import (
     wbc_paper,
     wbc_qp,
 )
-from wbm.robot.joints import NECK, WBC
+from wbm.robot.joints import BASE, NECK, WBC
 from wbm.robot.model import RobotModel
 from wbm.robot.spheres import SphereSet, robot_spheres, self_pairs
 
@@ -196,6 +196,7 @@ class WholeBodyController:
         frames.ee, frames.camera = (self.frame_names.index(n) for n in ("ee", "camera"))
         frames.ee_mask, frames.camera_mask = (t.frame_mask[n] for n in ("ee", "camera"))
         frames.base = self.frame_names.index("base")
+        frames.yaw = int(np.flatnonzero(BASE.start + 2 == WBC)[0])
         frames.pan = int(np.flatnonzero(NECK.start == WBC)[0])
         frames.pan_mount, frames.pan_zero = neck_pan(robot)
         self._frames = frames
@@ -216,6 +217,8 @@ class WholeBodyController:
         )
         self.sphere_margin = self._array((n, len(self.spheres)), wp.float32)
         weights, gains = asdict(cfg.weights), asdict(cfg.gains)
+        if cfg.solver == "paper":  # its equations know of neither
+            weights |= {"look": 0.0, "face": 0.0}
         self.weights = self._upload(np.tile(np.float32([weights[k] for k in self.weight_names]), (n, 1)), wp.float32)
         self.gains = self._upload(np.tile(np.float32([gains[k] for k in self.gain_names]), (n, 1)), wp.float32)
         targets = wbc_assemble.Targets()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from array import array
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -21,36 +22,43 @@ class LoopReport:
     Attributes:
         steps: commands sent.
         refusals: number of refusals by name.
-        missed: steps whose computation took longer than one policy period.
-        compute_s: computing time of each step, s.
-        start_s: when each step started, s (monotonic clock).
+        missed: deadlines missed: steps whose computation took longer than one policy period, and periods that passed
+            without a step.
+        compute_s: computing time of each step that ended in a command, s.
+        start_s: when each reading came, s (monotonic clock).
         stopped_by: name of the refusal that ended the run, or an empty string.
     """
 
     steps: int = 0
     refusals: Counter[str] = field(default_factory=Counter)
     missed: int = 0
-    compute_s: list[float] = field(default_factory=list)
-    start_s: list[float] = field(default_factory=list)
+    compute_s: array[float] = field(default_factory=lambda: array("d"))
+    start_s: array[float] = field(default_factory=lambda: array("d"))
     stopped_by: str = ""
 
     def timing(self) -> dict[str, float]:
-        """Percentiles of computing time and the jitter of the step's start (standard deviation of the period), s."""
-        return timing_summary(np.array(self.compute_s), np.array(self.start_s))
+        """See `timing_summary`."""
+        return timing_summary(np.array(self.compute_s), np.diff(self.start_s))
 
 
-def timing_summary(compute_s: np.ndarray, start_s: np.ndarray) -> dict[str, float]:
-    """`p50_s`, `p99_s`, `max_s` of computing times and `jitter_s`, `jitter_max_s` of the period."""
-    if not len(compute_s):
-        return {"p50_s": 0.0, "p99_s": 0.0, "max_s": 0.0, "jitter_s": 0.0, "jitter_max_s": 0.0}
-    period = np.diff(start_s)
-    spread = np.abs(period - np.median(period)) if len(period) else np.zeros(1)
+def timing_summary(compute_s: np.ndarray, period_s: np.ndarray) -> dict[str, float]:
+    """Percentiles of computing times, and how unevenly readings came.
+
+    Args:
+        compute_s: computing time of each step, s.
+        period_s: time between one reading and the next, s.
+
+    Returns:
+        `p50_s`, `p99_s`, `max_s` of the computing times, `jitter_s` (standard deviation of the period) and
+        `jitter_max_s` (its largest distance from the median); zeros where there is nothing to measure.
+    """
+    compute, period = (values if len(values) else np.zeros(1) for values in (compute_s, period_s))
     return {
-        "p50_s": float(np.percentile(compute_s, 50)),
-        "p99_s": float(np.percentile(compute_s, 99)),
-        "max_s": float(compute_s.max()),
-        "jitter_s": float(period.std()) if len(period) else 0.0,
-        "jitter_max_s": float(spread.max()),
+        "p50_s": float(np.percentile(compute, 50)),
+        "p99_s": float(np.percentile(compute, 99)),
+        "max_s": float(compute.max()),
+        "jitter_s": float(period.std()),
+        "jitter_max_s": float(np.abs(period - np.median(period)).max()),
     }
 
 
@@ -73,12 +81,17 @@ def run_loop(
     """
     check_driver(driver.info, runtime.contract)
     runtime.reset()
-    report, in_a_row = LoopReport(), 0
+    report, in_a_row, dt = LoopReport(), 0, runtime.contract.dt
+    before: float | None = None
     for _ in range(steps):
         try:
             reading = driver.read()
             begin = time.monotonic()
-            command = runtime.step(reading, driver.now())
+            report.start_s.append(begin)
+            now = driver.now()
+            report.missed += max(0, round((now - before) / dt) - 1) if before is not None else 0
+            before = now
+            command = runtime.step(reading, now)
             spent = time.monotonic() - begin
             driver.command(command)
         except Refused as refused:
@@ -95,8 +108,7 @@ def run_loop(
         in_a_row = 0
         report.steps += 1
         report.compute_s.append(spent)
-        report.start_s.append(begin)
-        report.missed += spent > runtime.contract.dt
+        report.missed += spent > dt
         if log is not None:
             log.reading(reading)
             log.command(command, runtime.observation)

@@ -24,7 +24,12 @@ class Probe:
         self._begun = time.monotonic() if real_time else None
         self._rng = np.random.default_rng(seed)
         self._time = 0.0
-        self._q, self._qd = np.clip(contract.q_home, contract.q_min, contract.q_max), np.zeros(len(contract.q_home))
+        self.home()
+
+    def home(self) -> None:
+        """Stand at the home pose, at rest."""
+        c = self._contract
+        self._q, self._qd = np.clip(c.q_home, c.q_min, c.q_max), np.zeros(len(c.q_home))
 
     @property
     def info(self) -> DriverInfo:

@@ -99,10 +99,10 @@ class PolicyRuntime:
         action = self._policy({k: v[None] for k, v in self.observation.items()})[0]
         spec = self.contract.schema.action
         action = np.clip(action, -spec.limit, spec.limit)
-        target, velocity = self.safety.limit(to_target(q, action.astype(np.float64), spec))
+        target, velocity = self.safety.limit(to_target(np, q, action.astype(np.float64), spec))
         self._check_workspace(target)
         # As in training, the action of the step before is what was commanded, after every limit.
-        self._previous = to_increment(q, target, spec).astype(np.float32)
+        self._previous = to_increment(np, q, target, spec).astype(np.float32)
         return Command(now, target, velocity, action.astype(np.float32))
 
     def recover(self) -> None:

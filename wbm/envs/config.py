@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from wbm.envs.seen_config import SeenConfig
+
 
 @dataclass(frozen=True)
 class ActionConfig:
@@ -61,11 +63,13 @@ class RewardConfig:
         drop: subtracted once when an episode ends early: dropped, out of reach or in a forbidden contact.
         scale: common factor, 1/step.
         reach_length: decay of the reaching term, m.
+        reach_far, reach_far_length: weight within the reaching term of a part that is felt from afar, and its decay, m.
         enclose: share of the enclosing shape beside the contact pattern in the grasp term.
         lift_open: share of the lift term that is paid without opposition.
         goal_height: height above the settled height that the lift term asks for, m.
         goal_width: how sharply, m.
         overshoot_height, overshoot_width: the lift term decays above this height, m.
+        drift_free, drift_width: it decays too beyond this horizontal distance from the settled place, m.
         hold: weight of holding the object above the success height inside the stability term.
         slip_speed, spin_speed: speeds relative to the hand at which the stability term has decayed, m/s and rad/s.
         support_force: hand force on supports and distractors that counts as one collision unit, N.
@@ -83,12 +87,16 @@ class RewardConfig:
     drop: float = 50.0
     scale: float = 0.02
     reach_length: float = 0.10
+    reach_far: float = 0.0
+    reach_far_length: float = 0.6
     enclose: float = 0.5
     lift_open: float = 0.25
     goal_height: float = 0.16
     goal_width: float = 0.05
     overshoot_height: float = 0.20
     overshoot_width: float = 0.05
+    drift_free: float = 0.06
+    drift_width: float = 0.08
     hold: float = 2.0
     slip_speed: float = 0.15
     spin_speed: float = 3.0
@@ -96,7 +104,8 @@ class RewardConfig:
     grip_force: float = 15.0
 
     def __post_init__(self) -> None:
-        for name in ("reach_length", "goal_width", "overshoot_width", "slip_speed", "spin_speed", "support_force"):
+        lengths = ("reach_length", "reach_far_length", "goal_width", "overshoot_width", "drift_width")
+        for name in (*lengths, "slip_speed", "spin_speed", "support_force"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"env.reward.{name} must be positive, not {getattr(self, name)}")
 
@@ -169,6 +178,8 @@ class EnvConfig:
         end_on_collision: end the episode at the first forbidden contact; else it is judged at the end.
         max_speed: object speed that means the physics is unstable, m/s.
         starts_per_scene: pre-grasp solutions kept for each scene.
+        observe: `privileged` (the teacher always knows the target's pose) or `seen` (only while the camera sees it).
+        seen: what `observe=seen` means.
     """
 
     start: str = "local"
@@ -192,6 +203,8 @@ class EnvConfig:
     end_on_collision: bool = True
     max_speed: float = 15.0
     starts_per_scene: int = 8
+    observe: str = "privileged"
+    seen: SeenConfig = field(default_factory=SeenConfig)
     action: ActionConfig = field(default_factory=ActionConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
@@ -199,6 +212,8 @@ class EnvConfig:
     def __post_init__(self) -> None:
         if self.start not in ("local", "whole_body"):
             raise ValueError(f"env.start is {self.start!r}; choose local or whole_body")
+        if self.observe not in ("privileged", "seen"):
+            raise ValueError(f"env.observe is {self.observe!r}; choose privileged or seen")
         if not 0.0 <= self.pregrasp_share <= 1.0:
             raise ValueError(f"env.pregrasp_share must be within 0 and 1, not {self.pregrasp_share}")
         if self.episode_s <= self.success_hold_s:

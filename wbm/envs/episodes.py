@@ -12,9 +12,9 @@ from torch import Tensor
 
 from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.outcome import REASONS, SUCCESS
-from wbm.envs.perception import MIN_TARGET_PIXELS, Perception, Sight, base_frame_action, joint_limits, joint_targets
+from wbm.envs.perception import MIN_TARGET_PIXELS, Perception, Sight, joint_limits
 from wbm.robot import joints
-from wbm.robot.schema import PolicySchema
+from wbm.robot.schema import PolicySchema, to_increment, to_target
 
 SETTLING_S = 1.0
 """Visibility of the target is counted after this time."""
@@ -110,7 +110,8 @@ class StudentDriver:
         """Act on what is seen."""
         assert sight is not None
         action = torch.as_tensor(self.policy(sight.obs), dtype=torch.float32, device=env.device)
-        return env.step_targets(joint_targets(env.state.q.float(), action, self.schema, self.low, self.high))
+        target = to_target(torch, env.state.q.float(), action, self.schema.action)
+        return env.step_targets(target.clamp(self.low, self.high))
 
 
 class EpisodeRunner:
@@ -211,8 +212,9 @@ class EpisodeRunner:
             env.noise = self._noise[elapsed.clamp(max=len(self._noise) - 1), torch.arange(env.num_envs)]
         _, _, done, info = driver.step(env, sight)
         command = info["ctrl"].float()
-        action = base_frame_action(q, command, self.schema)
-        executed = action if env.noise is None else base_frame_action(q, command + env.noise, self.schema)
+        action = to_increment(torch, q, command, self.schema.action)
+        noisy = env.noise is not None
+        executed = to_increment(torch, q, command + env.noise, self.schema.action) if noisy else action
         self._previous.copy_(executed)
         ended = info["ended"]
         self._count(sight, elapsed, ended)

@@ -19,26 +19,30 @@ from wbm.envs.outcome import RUNNING, SUCCESS, UNSTABLE, Outcome
 from wbm.envs.pregrasp import StartBank
 from wbm.envs.randomization import Randomizer
 from wbm.envs.sensing import StateReader
+from wbm.envs.state import GraspState
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 from wbm.sim.config import SimConfig
 from wbm.sim.simulation import make_simulation
+
+_LIVE = ("episode", "scene", "scene_weight", "elapsed", "ctrl", "previous", "posture")
 
 
 class GraspEnv:
     """N episodes of grasping the target of a scene.
 
     `step` takes a teacher's action [N,A]; `step_targets` takes 32 joint targets, as a student gives them. An episode is
-    determined by (seed, episode number) alone, not by its environment.
+    determined by (seed, episode number) alone, not by its environment (a curriculum adds `scene_weight`).
 
     Attributes:
         obs: the teacher's observation [N,O] of the present state; its labels are `observe.labels`.
-        state: the present `GraspState`.
+        state: the present `GraspState`; known: what policy and gaze know of it, the same unless a subclass hides some.
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
         phase: 0 free space, 1 contact-rich [N].
         started_near: episodes that started at the pre-grasp [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
+        scene_weight: relative chance of every scene [S] to be drawn; equal until a curriculum changes it.
     """
 
     def __init__(
@@ -72,6 +76,7 @@ class GraspEnv:
         self.episode = torch.full((num_envs,), -1, dtype=torch.int64, device=device)
         self.scene = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.elapsed = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.scene_weight = torch.ones(binding.table.count, dtype=torch.float64, device=device)
         self.ctrl = self.sim.ctrl.clone()
         self.noise: Tensor | None = None
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
@@ -123,7 +128,7 @@ class GraspEnv:
 
     def _live(self) -> dict[str, Tensor]:
         """The environment's own state tensors by name."""
-        own = {name: getattr(self, name) for name in ("episode", "scene", "elapsed", "ctrl", "previous", "posture")}
+        own = {name: getattr(self, name) for name in _LIVE}
         parts = {"action": self.action, "hand": self.action.hand, "outcome": self.outcome, "reader": self.reader}
         for part, item in parts.items():
             own |= {f"{part}.{name}": value for name, value in vars(item).items() if name in item.STATE}
@@ -145,7 +150,9 @@ class GraspEnv:
         u = self._uniforms(episodes)
         table = self.binding.table
         if self.cfg.randomization.scene:
-            scenes = (u[:, self._pick].squeeze(1) * table.count).long().clamp_(max=table.count - 1)
+            edges = self.scene_weight.cumsum(0)
+            scenes = torch.searchsorted(edges, u[:, self._pick].squeeze(1).double() * edges[-1], right=True)
+            scenes.clamp_(max=table.count - 1)
         else:
             scenes = torch.from_numpy(episodes % table.count).to(self.device)
         q = self._start_joints(ids, scenes, u)
@@ -177,7 +184,10 @@ class GraspEnv:
 
     def _start_joints(self, ids: Tensor, scenes: Tensor, u: Tensor) -> Tensor:
         """Joint positions [K,32] in which the episodes of environments `ids` start."""
-        return self.starts.draw(scenes, u[:, self._start].squeeze(1))
+        q = self.starts.draw(scenes, u[:, self._start].squeeze(1))
+        if self.cfg.action.neck == "fixed":
+            q[:, joints.NECK] = self._neck_home
+        return q
 
     def _contact_steps(self) -> Tensor:
         """Policy steps [N] since the contact-rich phase began."""
@@ -195,7 +205,7 @@ class GraspEnv:
         Returns:
             The observation [N,O] (of the next episode where one ended), rewards [N], done flags [N] and a dictionary:
             `time_outs` [N] (ended by time alone), `outcome` [N] (see `outcome.REASONS`, `RUNNING` where it goes on),
-            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` [N] that the step
+            `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` and `scene` [N] that the step
             belonged to,
             `ctrl` [N,32] clean joint targets, and `ended`, what the step led to before any restart: `held`, `height`,
             `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
@@ -209,11 +219,21 @@ class GraspEnv:
     def step_targets(self, ctrl: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
         """One policy step with joint targets [N,32] in place of the controller's; returns what `step` does."""
         self.ctrl.copy_(ctrl)
+        self._fix_neck()
         return self._advance(torch.zeros_like(self.previous))
+
+    def _fix_neck(self) -> None:
+        """Without active vision the neck is told to stay at its home pose, whoever commands the other joints."""
+        if self.cfg.action.neck == "fixed":
+            self.ctrl[:, joints.NECK] = self._neck_home
+
+    def _known(self, s: GraspState) -> GraspState:
+        """What policy and gaze know of the state: all of it."""
+        return s
 
     def _command(self) -> None:
         """Fill `ctrl` from the action term, through the controller unless the term is in joint space."""
-        term, s = self.action, self.state
+        term = self.action
         self.ctrl[:, joints.HAND] = term.hand.target
         if self.cfg.action.term == "joint":
             self.ctrl[:, self._body] = term.target
@@ -224,11 +244,10 @@ class GraspEnv:
         self.ee_velocity.copy_(term.velocity)
         self.ee_target.copy_(term.pos)
         self.ee_target_quat.copy_(term.quat)
-        self.gaze.copy_(s.obj_pos_w)
+        self.gaze.copy_(self.known.obj_pos_w)
         self.controller.step()
         self.ctrl[:, self._body] = self.body_ctrl
-        if self.cfg.action.neck == "fixed":
-            self.ctrl[:, joints.NECK] = self.posture[:, -6:]
+        self._fix_neck()
 
     def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
         self.sim.ctrl.copy_(self.ctrl if self.noise is None else self.ctrl + self.noise)
@@ -245,7 +264,7 @@ class GraspEnv:
         reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed & (code != SUCCESS))
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
-        info |= {"ctrl": self.ctrl.clone(), "ended": self._ended()}
+        info |= {"scene": self.scene.clone(), "ctrl": self.ctrl.clone(), "ended": self._ended()}
         ids = done.nonzero().squeeze(1)
         if len(ids):
             self._begin(ids)
@@ -262,7 +281,8 @@ class GraspEnv:
         """Recompute frames, state and observation from the simulation."""
         self.q_in.copy_(self.sim.qpos[:, : joints.NUM_JOINTS])
         self.controller.forward_kinematics()
-        self.state = s = self.reader.read(self.frame_pos, self.frame_quat)
+        self.state = self.reader.read(self.frame_pos, self.frame_quat)
+        self.known = s = self._known(self.state)
         time = self._contact_steps() / self.max_steps
         offset = self.action.offset(s.q, s.ee_pos_w, s.ee_quat)
         self.obs = self.observe(
@@ -292,6 +312,7 @@ class GraspEnv:
             name: wp.to_torch(getattr(c, name)) for name in ("qd", "q_target", "min_distance", "_fresh")
         }
         self._body = torch.as_tensor(joints.WBC, device=self.device)
+        self._neck_home = torch.tensor(self.robot.q_home[joints.NECK], dtype=torch.float32, device=self.device)
 
     def _obstacles(self, ids: Tensor, scenes: Tensor) -> None:
         t = self.binding.table

@@ -114,4 +114,5 @@ class TeacherObservation:
             offset,
             previous,
         ]
-        return (torch.cat(parts, dim=1) * self.scale).clamp_(-5.0, 5.0)
+        entries = torch.cat(parts, dim=1)
+        return (entries * self.scale[: entries.shape[1]]).clamp_(-5.0, 5.0)

@@ -139,28 +139,6 @@ class Perception:
         return torch.stack([c * delta[:, 0] + s * delta[:, 1], -s * delta[:, 0] + c * delta[:, 1], delta[:, 2]], -1)
 
 
-def base_frame_action(q: Tensor, ctrl: Tensor, schema: PolicySchema) -> Tensor:
-    """Joint targets [N,32] as actions of the schema at joints `q` [N,32]; see `wbm.robot.schema.to_increment`."""
-    spec = schema.action
-    delta = ctrl - q
-    c, s = torch.cos(q[:, 2]), torch.sin(q[:, 2])
-    x, y = delta[:, 0].clone(), delta[:, 1].clone()
-    delta[:, 0], delta[:, 1] = c * x + s * y, -s * x + c * y
-    scale = torch.tensor(spec.scale, dtype=delta.dtype, device=delta.device)
-    return (delta / scale).clamp(-spec.limit, spec.limit)
-
-
-def joint_targets(q: Tensor, action: Tensor, schema: PolicySchema, low: Tensor, high: Tensor) -> Tensor:
-    """Joint targets [N,32] of actions [N,32] within the joint limits; see `wbm.robot.schema.to_target`."""
-    spec = schema.action
-    scale = torch.tensor(spec.scale, dtype=q.dtype, device=q.device)
-    delta = action.clamp(-spec.limit, spec.limit) * scale
-    c, s = torch.cos(q[:, 2]), torch.sin(q[:, 2])
-    x, y = delta[:, 0].clone(), delta[:, 1].clone()
-    delta[:, 0], delta[:, 1] = c * x - s * y, s * x + c * y
-    return torch.maximum(torch.minimum(q + delta, high), low)
-
-
 def joint_limits(robot: RobotModel, device: str) -> tuple[Tensor, Tensor]:
     """Lower and upper joint limits [32] as tensors."""
     assert len(robot.q_min) == joints.NUM_JOINTS

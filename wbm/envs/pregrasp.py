@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -11,13 +10,14 @@ import warp as wp
 from torch import Tensor
 
 from wbm.control.config import WbcConfig
+from wbm.control.planner import Target, pregrasp_poses
 from wbm.control.wbc import WholeBodyController
 from wbm.envs.actions import HAND_OPEN
 from wbm.envs.binding import SceneTable
 from wbm.envs.config import EnvConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.randomization import scaled
-from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, quat_to_mat, rotate
+from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
@@ -26,11 +26,13 @@ from wbm.robot.model import RobotModel
 class StartBank:
     """Joint positions at pre-grasps: `q` [S,K,32]; scene s has `count[s]` of them, first in its row.
 
+    `clearance` [S] is the largest distance from everything among a scene's starts, m, -inf without one.
     A scene without a reachable pre-grasp has a count of 0; `draw` must not be asked for it.
     """
 
     q: Tensor
     count: Tensor
+    clearance: Tensor = field(default_factory=lambda: torch.zeros(0))
 
     def draw(self, scenes: Tensor, uniform: Tensor) -> Tensor:
         """One start [K,32] for each of `scenes` [K], picked by `uniform` [K] in [0, 1)."""
@@ -43,36 +45,17 @@ class StartBank:
         return self.count.nonzero().squeeze(1)
 
 
-def grasp_poses(table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Pre-grasp positions [B,3] and orientations [B,4] of the grasp frame, jittered by `u` [B,7].
+def target_of(table: SceneTable, scenes: Tensor) -> Target:
+    """The targets of `scenes` [B] as the planner sees them."""
+    t = table
+    rows = (t.target_pos, t.target_quat, t.box_half, t.base[:, 2], t.support_height, t.ceiling_height)
+    return Target(*(values[scenes] for values in rows))
 
-    `top_down`: z down above the target, x (the direction in which fingers and thumb close) along the shorter horizontal
-    axis of its bounding box. `side`: z horizontal, x horizontal, so that the fingers wrap around an upright object.
-    """
+
+def grasp_poses(table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Pre-grasp positions [B,3] and orientations [B,4] of the grasp frame, jittered by `u` [B,7]."""
     r = cfg.randomization
-    mat = quat_to_mat(table.target_quat[scenes])
-    centre = table.target_pos[scenes]
-    extent = mat.abs() @ table.box_half[scenes].unsqueeze(-1)  # half extents along the world's axes
-    top = centre[:, 2] + extent[:, 2, 0]
-    if grasp == "top_down":
-        shape = (mat * table.box_half[scenes].unsqueeze(1))[:, :2]  # box axes scaled, seen from above [B,2,3]
-        spread = shape @ shape.transpose(1, 2)
-        yaw = 0.5 * torch.atan2(2 * spread[:, 0, 1], spread[:, 0, 0] - spread[:, 1, 1]) + math.pi / 2
-        # Of the two opposite directions the one that points away from the base is in the wrist's reach.
-        yaw = torch.where(torch.cos(yaw - table.base[scenes, 2]) < 0, yaw + math.pi, yaw)
-        zero = torch.zeros_like(yaw)
-        down = torch.tensor([0.0, 1.0, 0.0, 0.0], device=yaw.device).expand(len(yaw), 4)
-        quat = quat_mul(quat_exp(torch.stack([zero, zero, yaw], -1)), down)
-        pos = torch.stack([centre[:, 0], centre[:, 1], top + cfg.standoff], -1)
-    else:
-        yaw = table.base[scenes, 2] + 1.2 * (u[:, 0] - 0.5)  # from where the robot stands
-        zero = torch.zeros_like(yaw)
-        # Columns x, y, z of the unturned frame: x to the left, y down, z ahead.
-        ahead = torch.tensor([0.5, 0.5, 0.5, 0.5], device=yaw.device).expand(len(yaw), 4)
-        quat = quat_mul(quat_exp(torch.stack([zero, zero, yaw], -1)), ahead)
-        radius = extent[:, :2, 0].amax(1) + cfg.standoff
-        away = torch.stack([torch.cos(yaw), torch.sin(yaw), zero], -1) * radius.unsqueeze(1)
-        pos = centre - away
+    pos, quat = pregrasp_poses(target_of(table, scenes), grasp, cfg.standoff, u[:, 0])
     turn = torch.stack([scaled(r.start_tilt, u[:, 1]), scaled(r.start_tilt, u[:, 2]), scaled(r.start_yaw, u[:, 3])], -1)
     shift = torch.stack([scaled(r.start_offset, u[:, k]) for k in (4, 5, 6)], -1)
     return pos + rotate(quat, shift), quat_mul(quat, quat_exp(turn))
@@ -105,6 +88,8 @@ def solve_starts(
     count, keep = table.count, cfg.starts_per_scene
     bank = torch.zeros(count, keep, joints.NUM_JOINTS, device=device)
     found = torch.zeros(count, dtype=torch.int64, device=device)
+    room = torch.full((count,), -torch.inf, device=device)
+    batch = min(batch, count * keep)
     solver = _Solver(table, robot, wbc_cfg, batch, device)
     columns, tried = Columns(), 0
     jitter, stand = columns.add("jitter", 7), columns.add("stand", 3)
@@ -116,7 +101,8 @@ def solve_starts(
             u = torch.from_numpy(episode_uniforms(seed, np.arange(tried, tried + len(part)), columns.count)).to(device)
             tried += len(part)
             pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter])
-            q, good = solver.solve(part, pos, quat, stand_poses(table.base[part], u[:, stand]), iterations)
+            q, good, clear = solver.solve(part, pos, quat, stand_poses(table.base[part], u[:, stand]), iterations)
+            room.scatter_reduce_(0, part[good], clear[good], "amax")
             for scene, row in zip(part[good].tolist(), q[good], strict=True):
                 if found[scene] < keep:
                     bank[scene, found[scene]] = row
@@ -125,7 +111,7 @@ def solve_starts(
         raise ValueError(
             f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff"
         )
-    return StartBank(bank, found)
+    return StartBank(bank, found, room)
 
 
 def stand_poses(base: Tensor, u: Tensor) -> Tensor:
@@ -158,8 +144,8 @@ class _Solver:
         self.home[joints.HAND] = torch.tensor(HAND_OPEN, device=device)
         self.body = torch.as_tensor(joints.WBC, device=device)
 
-    def solve(self, scenes: Tensor, pos: Tensor, quat: Tensor, base: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-        """Joint positions [B,32] and which of them are good [B]."""
+    def solve(self, scenes: Tensor, pos: Tensor, quat: Tensor, base: Tensor, iterations: int) -> tuple[Tensor, ...]:
+        """Joint positions [B,32], which of them are good [B], and their distance from everything [B], m."""
         t, size = self.table, len(scenes)
         pad = torch.arange(self.batch, device=scenes.device) % size
         for live, values in zip(
@@ -180,4 +166,4 @@ class _Solver:
         error = (self.frame_pos[:, self.ee] - self.pos).norm(dim=-1)
         angle = quat_log(quat_mul(quat_conj(self.frame_quat[:, self.ee]), self.quat)).norm(dim=-1)
         good = (error < 0.02) & (angle < 0.15) & (self.distance > 0.005)
-        return self.q[:size].clone(), good[:size].clone()
+        return self.q[:size].clone(), good[:size].clone(), self.distance[:size].clone()

@@ -15,8 +15,12 @@ TERMS = ("reach", "contact", "grasp", "lift", "stable", "col", "act", "smooth")
 
 
 def reach(s: GraspState, c: RewardConfig) -> Tensor:
-    """exp(-mean tip gap / l) + exp(-centre gap / l) / 2: hand and fingertips come near the object."""
-    return torch.exp(-s.tip_gap.mean(-1) / c.reach_length) + 0.5 * torch.exp(-s.centre_gap / c.reach_length)
+    """exp(-mean tip gap / l) + exp(-centre gap / l) / 2: hand and fingertips come near the object.
+
+    Episodes that start far away may add `reach_far` exp(-centre gap / L), whose slope is felt there.
+    """
+    near = torch.exp(-s.tip_gap.mean(-1) / c.reach_length) + 0.5 * torch.exp(-s.centre_gap / c.reach_length)
+    return near if c.reach_far == 0 else near + c.reach_far * torch.exp(-s.centre_gap / c.reach_far_length)
 
 
 def contact(s: GraspState, c: RewardConfig) -> Tensor:
@@ -30,11 +34,14 @@ def grasp(s: GraspState, c: RewardConfig) -> Tensor:
 
 
 def lift(s: GraspState, c: RewardConfig) -> Tensor:
-    """Height above the settled height up to the goal, paid for opposition, decaying where the object is flung."""
+    """Height above the settled height up to the goal, paid for opposition, decaying where the object is flung or
+    carried away.
+    """
     rise = (s.height / c.goal_height).clamp(0.0, 1.0)
     near = 0.5 * torch.exp(-(s.height - c.goal_height).abs() / c.goal_width)
     overshoot = torch.exp(-(s.height - c.overshoot_height).clamp(min=0.0) / c.overshoot_width)
-    return (c.lift_open + (1 - c.lift_open) * s.opposition) * (rise + near * rise) * overshoot
+    away = torch.exp(-(s.drift - c.drift_free).clamp(min=0.0) / c.drift_width)
+    return (c.lift_open + (1 - c.lift_open) * s.opposition) * (rise + near * rise) * overshoot * away
 
 
 def stable(s: GraspState, c: RewardConfig) -> Tensor:

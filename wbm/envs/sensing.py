@@ -115,6 +115,7 @@ class StateReader:
             obstacle_force=hand_obstacle,
             forbidden=forbidden,
             height=height,
+            drift=(obj_pos - self.start_pos)[:, :2].norm(dim=-1),
             lifted=lifted,
             held=held,
             holding=((height >= c.success_height) & (held > 0)).float(),

@@ -43,6 +43,7 @@ class GraspState:
     obstacle_force: Tensor  # hand on supports and distractors
     forbidden: Tensor
     height: Tensor  # above the settled height
+    drift: Tensor  # horizontal distance from the settled place
     lifted: Tensor
     held: Tensor  # lifted or not, the hand has hold of it
     holding: Tensor  # held above the success height

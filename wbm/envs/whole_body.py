@@ -5,15 +5,26 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor
 
+from wbm.control.base_path import BaseMap, Obstacles, base_path
 from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
 from wbm.robot import joints
 
 FREE, CONTACT = 0, 1
 NEAR_WAYPOINT = (0.05, 0.3)  # m and rad at which the waypoint counts as passed
-NEAR_PREGRASP = (0.02, 0.15)
+NEAR_PREGRASP = (0.008, 0.06)  # the same at which the pre-grasp counts as reached, with the joints nearly at rest
+GOOD_PREGRASP = (0.02, 0.15)  # and after `LINGER` s of trying, in whatever motion
+LINGER = 1.6
+CALM = (0.04, 0.10)  # m/s of the base and rad/s of arm joints that count as rest
+MAX_CORNERS = 12
+NEAR_CORNER = 0.15  # m at which a corner of the base's way counts as passed
+CARROT = 1.0  # m ahead of the base at which its target moves along the way
+DETOUR_WEIGHTS = {"ee_position": 0.0, "ee_rotation": 0.0, "posture": 0.1, "posture_base": 1.0}
+APPROACH_WEIGHTS = {"posture": 0.05, "posture_base": 0.2}
+"""On the way to the pre-grasp; the body ends where the pre-grasp was solved, not just the hand."""
 
 
 class WholeBodyEnv(GraspEnv):
@@ -21,10 +32,10 @@ class WholeBodyEnv(GraspEnv):
     takes over.
 
     In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed
-    in the
-    world (a target that followed the base would make the controller chase itself), and the posture is the
-    pre-grasp's. A
-    teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves through both phases alike.
+    in the world (a target that followed the base would make the controller chase itself), and the posture is the
+    pre-grasp's, base included. Where obstacles block the straight way of the base, the base first follows the planner's corners with
+    the arm held as it is. A teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves
+    through both phases alike.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -33,9 +44,19 @@ class WholeBodyEnv(GraspEnv):
         n, device = self.num_envs, self.device
         self._near = self.columns.add("near")
         self._stage = torch.zeros(n, dtype=torch.int64, device=device)
-        self._contact_since = torch.zeros(n, dtype=torch.int64, device=device)
+        self._contact_since, self._close_since = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(2))
         self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
         self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
+        self._corner = torch.zeros(n, MAX_CORNERS, 2, device=device)
+        self._corners, self._corner_at = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(2))
+        self._start_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
+        names: list[str] = list(self.controller.weight_names)
+        weights = wp.to_torch(self.controller.weights)
+        self._weights = []
+        for name, detour in DETOUR_WEIGHTS.items():
+            column = weights[:, names.index(name)]
+            usual = column[0].item()
+            self._weights.append((column, detour, APPROACH_WEIGHTS.get(name, usual), usual))
 
     @property
     def limit_steps(self) -> int:
@@ -47,10 +68,26 @@ class WholeBodyEnv(GraspEnv):
         near = u[:, self._near].squeeze(1) < self.cfg.pregrasp_share
         self._goal_q[ids], self.started_near[ids] = goal, near
         self.phase[ids] = torch.where(near, CONTACT, FREE).to(torch.uint8)
-        self._stage[ids], self._contact_since[ids] = 0, 0
+        self._stage[ids], self._contact_since[ids], self._close_since[ids] = 0, 0, 0
         away = self.binding.table.q_start[scenes].to(goal)
         away[:, joints.HAND] = goal[:, joints.HAND]
-        return torch.where(near.unsqueeze(1), goal, away)
+        start = torch.where(near.unsqueeze(1), goal, away)
+        self._corners[ids], self._corner_at[ids], self._start_q[ids] = 0, 0, start
+        far = ~near
+        self._plan(ids[far], scenes[far], start[far], goal[far])
+        return start
+
+    def _plan(self, ids: Tensor, scenes: Tensor, start: Tensor, goal: Tensor) -> None:
+        """Corners of the base's way from `start` to `goal` [K,32]; none where the straight one is free."""
+        t = self.binding.table
+        for env, scene, a, b in zip(
+            ids.tolist(), scenes.tolist(), start.cpu().numpy(), goal.cpu().numpy(), strict=True
+        ):
+            rows = (t.obstacle_type, t.obstacle_size, t.obstacle_pos, t.obstacle_quat)
+            there = BaseMap(self.robot, a, float(b[2]), Obstacles(*(r[scene].cpu().numpy() for r in rows)))
+            corners = base_path(there, a[:2].astype(float), b[:2].astype(float))[:MAX_CORNERS]
+            self._corner[env, : len(corners)] = torch.as_tensor(corners, dtype=torch.float32)
+            self._corners[env] = len(corners)
 
     def _begin(self, ids: Tensor) -> None:
         super()._begin(ids)
@@ -78,6 +115,7 @@ class WholeBodyEnv(GraspEnv):
         contact = (self.phase == CONTACT).unsqueeze(1)
         action = action * contact
         self.action.apply(action, s.q, s.ee_pos_w, s.ee_quat)
+        self._follow()
         self._approach(~contact.squeeze(1))
         self._command()
         return self._advance(action)
@@ -97,12 +135,17 @@ class WholeBodyEnv(GraspEnv):
         distance, angle = self._errors(self._waypoint(), self._goal_quat)
         passed = free & (self._stage == 0) & (distance < NEAR_WAYPOINT[0]) & (angle < NEAR_WAYPOINT[1])
         self._stage[passed] = 1
+        self._close_since[passed] = self.elapsed[passed]
+        s = self.state
         distance, angle = self._errors(self._goal_pos, self._goal_quat)
-        arrived = free & (self._stage == 1) & (distance < NEAR_PREGRASP[0]) & (angle < NEAR_PREGRASP[1])
-        ids = arrived.nonzero().squeeze(1)
+        calm = (s.qd[:, :2].norm(dim=-1) < CALM[0]) & (s.qd[:, joints.ARM].abs().amax(1) < CALM[1])
+        settled = calm & (distance < NEAR_PREGRASP[0]) & (angle < NEAR_PREGRASP[1])
+        late = (self.elapsed - self._close_since) * self.period > LINGER
+        settled |= late & (distance < GOOD_PREGRASP[0]) & (angle < GOOD_PREGRASP[1])
+        ids = (free & (self._stage == 1) & settled).nonzero().squeeze(1)
         if len(ids):
-            s = self.state
             self.phase[ids], self._contact_since[ids] = CONTACT, self.elapsed[ids]
+            self.posture[ids] = s.q[ids][:, self._body].to(self.posture)
             self.action.reset(ids, s.q[ids].float(), s.ee_pos_w[ids], s.ee_quat[ids])
 
     def _approach(self, free: Tensor) -> None:
@@ -119,6 +162,35 @@ class WholeBodyEnv(GraspEnv):
         term.quat.copy_(torch.where(keep, term.quat, turned / turned.norm(dim=-1, keepdim=True)))
         hand = self._goal_q[:, joints.HAND].to(term.hand.target)
         term.hand.target.copy_(torch.where(keep, term.hand.target, hand))
+
+    def _follow(self) -> None:
+        """Lead the base along its corners; where none is left, the hand's own approach begins from where it is."""
+        s, at = self.state, self._corner_at
+        on = (self.phase == FREE) & (at < self._corners)
+        ids = torch.arange(self.num_envs, device=self.device)
+        base = s.q[:, :2].float()
+        away = self._corner[ids, at.clamp(max=MAX_CORNERS - 1)] - base
+        distance = away.norm(dim=-1, keepdim=True)
+        at += (on & (distance.squeeze(1) < NEAR_CORNER)).long()
+        ended = (on & (at >= self._corners)).nonzero().squeeze(1)
+        on &= at < self._corners
+        row = on.unsqueeze(1)
+        for weight, detour, approach, usual in self._weights:
+            weight.copy_(torch.where(on, detour, torch.where(self.phase == FREE, approach, usual)))
+        way = self._start_q[:, self._body].clone()
+        way[:, :2] = base + away * (CARROT / distance.clamp_min(1e-6))
+        way[:, 2] = self._goal_q[:, 2]
+        goal = self._goal_q[:, self._body].to(self.posture)
+        self.posture.copy_(
+            torch.where(
+                row,
+                way.to(self.posture),
+                torch.where(((self.phase == FREE) & (self._corners > 0)).unsqueeze(1), goal, self.posture),
+            )
+        )
+        hold = torch.cat([ids[on], ended])
+        if len(hold):
+            self.action.reset(hold, s.q[hold].float(), s.ee_pos_w[hold], s.ee_quat[hold])
 
 
 def _towards(start: Tensor, goal: Tensor, step: float) -> Tensor:

@@ -8,10 +8,12 @@ import numpy as np
 import torch
 
 from wbm.control.config import WbcConfig
+from wbm.control.planner import AMPLE, GRASPS, PREFERENCE, choose_grasp, fits
 from wbm.envs.binding import SceneBinding
 from wbm.envs.config import EnvConfig
 from wbm.envs.grasp_env import GraspEnv
-from wbm.envs.pregrasp import StartBank, solve_starts
+from wbm.envs.pregrasp import StartBank, solve_starts, target_of
+from wbm.envs.seen_env import SeenEnv
 from wbm.envs.whole_body import WholeBodyEnv
 from wbm.robot.config import MjcfOptions
 from wbm.robot.joints import NUM_JOINTS
@@ -20,8 +22,6 @@ from wbm.scenes.bank import SceneBank
 from wbm.scenes.config import KINDS
 from wbm.scenes.model import SceneModel, SceneModelConfig
 from wbm.sim.config import SimConfig
-
-GRASPS = ("top_down", "side")
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,12 @@ def make_env(
     seed: int,
     device: str = "cpu",
     scene_model: SceneModel | None = None,
+    grasps: tuple[str, ...] = (),
 ) -> GraspEnv:
     """An environment over the scenes `rows`; local or whole-body as `cfg.env.start` says.
 
-    Scenes without a reachable pre-grasp are left out, whatever teacher their hint asks for.
+    Scenes without a reachable pre-grasp are left out. With `grasps`, the kinds that there is a policy for, a scene's
+    hint is only a preference: `env.binding.bank.approach` holds what the planner chose instead.
 
     Raises:
         ValueError: no scene has a reachable pre-grasp.
@@ -68,32 +70,57 @@ def make_env(
     bank = assets.scenes
     template = SceneModelConfig(num_distractors=bank.num_distractors)
     model = scene_model or SceneModel(assets.objects, template, cfg.robot, assets.robot)
-    starts = find_starts(SceneBinding(model, bank, rows, device), cfg, seed, device)
+    tried = SceneBinding(model, bank, rows, device)
+    starts, approach = find_starts(tried, cfg, seed, device, grasps)
     usable = starts.usable.cpu().numpy()
+    bank = replace(bank, approach=bank.approach.copy())
+    bank.approach[rows] = approach
     binding = SceneBinding(model, bank, rows[usable], device)
     kept = StartBank(starts.q[starts.usable], starts.count[starts.usable])
-    kind = WholeBodyEnv if cfg.env.start == "whole_body" else GraspEnv
-    return kind(binding, kept, model.robot, cfg.env, cfg.sim, cfg.wbc, num_envs, seed, device)
+    env = cfg.env
+    kind = WholeBodyEnv if env.start == "whole_body" else GraspEnv
+    if env.observe == "seen":
+        kind, env = SeenEnv, env if env.start == "whole_body" else replace(env, pregrasp_share=1.0)
+    return kind(binding, kept, model.robot, env, cfg.sim, cfg.wbc, num_envs, seed, device)
 
 
-def find_starts(binding: SceneBinding, cfg: WorldConfig, seed: int, device: str) -> StartBank:
-    """Pre-grasps of every scene, each by the approach that its record hints at."""
-    robot, approach = binding.scene_model.robot, binding.bank.approach[binding.scenes]
-    q = torch.zeros(len(approach), cfg.env.starts_per_scene, NUM_JOINTS, device=device)
-    count = torch.zeros(len(approach), dtype=torch.int64, device=device)
-    for code, grasp in enumerate(GRASPS):
-        part = np.flatnonzero(approach == code)
-        if len(part) == 0:
-            continue
-        some = SceneBinding(binding.scene_model, binding.bank, binding.scenes[part], device)
-        try:
-            found = solve_starts(some.table, robot, cfg.wbc, cfg.env, grasp, seed, device)
-        except ValueError:
-            continue
-        q[part], count[part] = found.q, found.count
-    if int(count.sum()) == 0:
+def find_starts(
+    binding: SceneBinding, cfg: WorldConfig, seed: int, device: str, grasps: tuple[str, ...] = ()
+) -> tuple[StartBank, np.ndarray]:
+    """Pre-grasps of every scene, and the kind of grasp [S] that each is for.
+
+    The kind is the one that the scene's record hints at. Where its pre-grasps are out of reach or short of room, the
+    planner also looks at the others of `grasps`.
+
+    Raises:
+        ValueError: no scene has a reachable pre-grasp.
+    """
+    hint = np.asarray(binding.bank.approach[binding.scenes])
+    keep, count = cfg.env.starts_per_scene, len(hint)
+    q = torch.zeros(len(GRASPS), count, keep, NUM_JOINTS, device=device)
+    found = torch.zeros(len(GRASPS), count, dtype=torch.int64, device=device)
+    room = torch.full((len(GRASPS), count), -torch.inf, device=device)
+    target = target_of(binding.table, torch.arange(count, device=device))
+    for other in (False, True):
+        wanting = room.amax(0).cpu().numpy() < (1.0 - PREFERENCE) * AMPLE  # else the hint wins in any case
+        for code, grasp in enumerate(GRASPS):
+            part = np.flatnonzero(hint == code)
+            if other:
+                room_for = fits(target, grasp, cfg.env.standoff).cpu().numpy()
+                part = np.flatnonzero((hint != code) & wanting & room_for & (grasp in grasps))
+            if len(part) == 0:
+                continue
+            some = SceneBinding(binding.scene_model, binding.bank, binding.scenes[part], device)
+            try:
+                bank = solve_starts(some.table, binding.scene_model.robot, cfg.wbc, cfg.env, grasp, seed, device)
+            except ValueError:
+                continue
+            q[code, part], found[code, part], room[code, part] = bank.q, bank.count, bank.clearance
+    if int(found.sum()) == 0:
         raise ValueError("no scene has a reachable pre-grasp; check the supports' heights and env.standoff")
-    return StartBank(q, count)
+    chosen = choose_grasp(room, torch.as_tensor(hint, device=device)).clamp_min(0)
+    scenes = torch.arange(count, device=device)
+    return StartBank(q[chosen, scenes], found[chosen, scenes], room[chosen, scenes]), chosen.cpu().numpy()
 
 
 def with_start(cfg: WorldConfig, start: str, pregrasp_share: float = 0.0) -> WorldConfig:

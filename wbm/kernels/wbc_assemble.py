@@ -54,6 +54,7 @@ class Frames:
     camera: wp.int32
     camera_mask: wp.int32
     base: wp.int32
+    yaw: wp.int32  # controlled joint that turns the base
     pan: wp.int32  # controlled joint that turns the camera's arm about the vertical
     pan_mount: wp.vec3  # its place in the base frame, m
     pan_zero: wp.float32  # azimuth of the optical axis at pan 0 in the home pose, rad
@@ -125,12 +126,13 @@ def assemble_tasks(
         vel_out[e, 3 + i] = ang[i]
         weight_out[e, i] = targets.weights[e, obj.W_EE_POSITION]
         weight_out[e, 3 + i] = targets.weights[e, obj.W_EE_ROTATION]
-    vel_out[e, obj.ROW_GAZE] = turn
-    vel_out[e, obj.ROW_GAZE + 1] = 0.0
     vel_out[e, obj.ROW_DISTANCE] = radial
     weight_out[e, obj.ROW_GAZE] = w_gaze * targets.weights[e, obj.W_GAZE]
     weight_out[e, obj.ROW_GAZE + 1] = w_gaze * targets.weights[e, obj.W_GAZE]
-    weight_out[e, obj.ROW_DISTANCE] = wp.where(radial == 0.0, 0.0, w_gaze * targets.weights[e, obj.W_DISTANCE])
+    w_distance = wp.where(radial == 0.0, 0.0, w_gaze * targets.weights[e, obj.W_DISTANCE])
+    weight_out[e, obj.ROW_DISTANCE] = wp.where(radial > 0.0, obj.TOO_NEAR, 1.0) * w_distance
+    carried = wp.vec2(0.0, 0.0)
+    helps = obj.base_helps(theta)
     for j in range(screw.shape[1]):
         w = wp.spatial_top(screw[e, j])
         m = wp.spatial_bottom(screw[e, j])
@@ -142,14 +144,32 @@ def assemble_tasks(
         v_cam = m + wp.cross(w, p_cam - ref)
         on_cam = moved(frames.camera_mask, j)
         rows = obj.gaze_rows(w, v_cam, theta, u, t, distance)
+        if limits.base_scale[j] > 0.0:
+            # What the base does not do for the gaze, the neck makes up for: the base's last velocity is fed forward.
+            carried += (1.0 - helps) * qd_prev[e, j] * rows
+            rows = helps * rows
         jac_out[e, obj.ROW_GAZE, j] = on_cam * rows[0]
         jac_out[e, obj.ROW_GAZE + 1, j] = on_cam * rows[1]
         jac_out[e, obj.ROW_DISTANCE, j] = -on_cam * wp.dot(sight, v_cam)
-    look = wp.min(theta / obj.LOOK_ANGLE, 1.0)
-    look = wp.min(w_gaze, 1.0) * look * look * targets.weights[e, obj.W_LOOK]
+    vel_out[e, obj.ROW_GAZE] = turn - carried[0]
+    vel_out[e, obj.ROW_GAZE + 1] = -carried[1]
     target_b = se3.pose_inv_mul_pos(frame_pos[e, frames.base], frame_quat[e, frames.base], p_cam + to_target)
     pan = obj.look_pan(target_b, frames.pan_mount, frames.pan_zero)
+    look = wp.min(theta / obj.LOOK_ANGLE, 1.0)
+    look = wp.min(w_gaze, 1.0) * look * look * targets.weights[e, obj.W_LOOK]
     joint_diagonal(e, frames, targets, limits, q, qd_prev, look, pan, diag_out, rhs_out)
+    hand_b = se3.pose_inv_mul_pos(
+        frame_pos[e, frames.base], frame_quat[e, frames.base], p_ee + obj.finite3(targets.ee_pos[e] - p_ee)
+    )
+    yaw = frames.yaw
+    q_yaw = finite_or(q[e, limits.joint[yaw]], 0.0)
+    turn_base = obj.face_turn(hand_b, target_b, w_gaze > 0.0, q_yaw, limits.q_min[yaw], limits.q_max[yaw])
+    share = obj.face_share(turn_base, hand_b)
+    face = share * targets.weights[e, obj.W_FACE]
+    for i in range(6):
+        weight_out[e, i] = weight_out[e, i] * (1.0 - obj.FACE_WAIT * wp.min(face, share))
+    diag_out[e, yaw] = diag_out[e, yaw] + face
+    rhs_out[e, yaw] = rhs_out[e, yaw] + face * wp.clamp(2.0 * turn_base, -obj.FACE_SPEED, obj.FACE_SPEED)
 
 
 @wp.func

@@ -1,10 +1,10 @@
 """The controller's objectives as rows `J qd = v` with a weight each, one function an objective.
 
 Rows 0-2 are the hand's linear velocity, 3-5 its angular velocity, 6-7 the gaze, 8 the viewing distance. Posture,
-joint-limit centring, base weight, base smoothness and damping act on single joints and are a diagonal.
+joint-limit centring, base weight, base smoothness, facing and damping act on single joints and are a diagonal.
 """
 
-# ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
+# ruff: noqa: RUF046, UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
 from wbm.kernels import se3
@@ -19,7 +19,7 @@ ROW_DISTANCE = wp.constant(8)
 # Columns of the live arrays `weights` and `gains`, one row an environment.
 WEIGHT_NAMES = (
     "ee_position", "ee_rotation", "gaze", "distance", "posture", "posture_base",
-    "centring", "base", "smoothness", "damping", "look", "collision",
+    "centring", "base", "smoothness", "damping", "look", "face", "collision",
 )  # fmt: skip
 GAIN_NAMES = (
     "ee_position", "ee_rotation", "gaze", "distance", "posture", "centring", "ee_speed", "ee_turn", "gaze_turn",
@@ -28,7 +28,7 @@ GAIN_NAMES = (
 )  # fmt: skip
 (
     W_EE_POSITION, W_EE_ROTATION, W_GAZE, W_DISTANCE, W_POSTURE, W_POSTURE_BASE,
-    W_CENTRING, W_BASE, W_SMOOTHNESS, W_DAMPING, W_LOOK, W_COLLISION,
+    W_CENTRING, W_BASE, W_SMOOTHNESS, W_DAMPING, W_LOOK, W_FACE, W_COLLISION,
 ) = (wp.constant(i) for i in range(len(WEIGHT_NAMES)))  # fmt: skip
 (
     K_EE_POSITION, K_EE_ROTATION, K_GAZE, K_DISTANCE, K_POSTURE, K_CENTRING, K_EE_SPEED, K_EE_TURN, K_GAZE_TURN,
@@ -42,6 +42,15 @@ NEAR_CAMERA = wp.constant(0.05)
 CENTRING_BAND = wp.constant(0.1)
 LOOK_ANGLE = wp.constant(0.5)  # rad, gaze error from which the neck's posture has its full weight
 LOOK_SPEED = wp.constant(1.5)  # rad/s
+HELP_ANGLE = wp.constant(0.8)  # rad, gaze error from which the base does nothing for the gaze
+FACE_HAND = wp.constant(1.15)  # rad, azimuth of the hand's goal in the base frame from which the base turns
+FACE_SIGHT = wp.constant(2.0)  # rad, the same of the target to look at
+FACE_BAND = wp.constant(0.3)  # rad over which the weight of turning rises
+FACE_NEAR = wp.constant(0.3)  # m from the base's axis within which the azimuth says little
+FACE_SPEED = wp.constant(0.8)  # rad/s
+FACE_WAIT = wp.constant(0.9)  # share of the hand's weight that waits for the base to face its goal
+TOO_NEAR = wp.constant(10.0)  # factor on the viewing distance's weight when the camera is too near
+FULL_TURN = wp.constant(6.2831855)  # rad
 AZIMUTH_FACTOR_MAX = wp.constant(1.5707964)
 
 
@@ -117,7 +126,10 @@ def gaze_rows(w: wp.vec3, v: wp.vec3, theta: float, u: wp.vec3, t: wp.vec3, dist
 
 @wp.func
 def distance_velocity(distance: float, nearest: float, farthest: float, gain: float) -> float:
-    """`D_dot* = k (clamp(D, nearest, farthest) - D)`, m/s, at most 0.3; zero inside the band. Its row is `-sight.v`."""
+    """`D_dot* = k (clamp(D, nearest, farthest) - D)`, m/s, at most 0.3; zero inside the band. Its row is `-sight.v`.
+
+    Too near it has ten times the weight: a camera that is drawn to its target by the rest sees nothing there.
+    """
     return wp.clamp(gain * (wp.clamp(distance, nearest, farthest) - distance), -0.3, 0.3)
 
 
@@ -128,14 +140,73 @@ def posture_velocity(q_posture: float, q: float, gain: float) -> float:
 
 
 @wp.func
+def wrapped(angle: float) -> float:
+    """The angle modulo a full turn, in -pi..pi."""
+    return wp.atan2(wp.sin(angle), wp.cos(angle))
+
+
+@wp.func
 def look_pan(target_b: wp.vec3, mount_b: wp.vec3, zero: float) -> float:
     """Pan angle (rad, -pi..pi) at which the neck's posture faces a point; all in the base frame.
 
     The gaze rows alone take the shortest turn, which can end at a joint limit with the target out of sight. In joint
     space the pan's whole range is open, so a posture that faces the target leads out of every such corner.
     """
-    angle = wp.atan2(target_b[1] - mount_b[1], target_b[0] - mount_b[0]) - zero
-    return wp.atan2(wp.sin(angle), wp.cos(angle))
+    return wrapped(wp.atan2(target_b[1] - mount_b[1], target_b[0] - mount_b[0]) - zero)
+
+
+@wp.func
+def base_helps(theta: float) -> float:
+    """Share (0..1) of the base's columns in the gaze rows: none from an error of 0.8 rad on, all at zero.
+
+    A camera that faces away turns over whatever axis is the shortest, and a base that turned with it would often put
+    the target farther behind. Near the target the base moves the arm out of the camera's way.
+    """
+    return wp.clamp(1.0 - theta / HELP_ANGLE, 0.0, 1.0)
+
+
+@wp.func
+def face_turn(hand_b: wp.vec3, target_b: wp.vec3, looks: bool, yaw: float, yaw_min: float, yaw_max: float) -> float:
+    """Turn of the base (rad) that brings the hand's goal ahead of it and the target into the neck's range.
+
+    With azimuths `a` (goal) and `b` (target, if the camera looks at one) in the base frame it is the smallest `x`
+    within yaw's range with `|a - x| <= 1.15` and `|b - x| <= 2`, modulo a full turn. The two sectors fill more than
+    the circle, so there is one. Behind the base the arm twists itself up, and left behind it the neck is blind.
+    """
+    a = wp.atan2(hand_b[1], hand_b[0])
+    b = wp.atan2(target_b[1], target_b[0])
+    reach = float(FACE_SIGHT)
+    if not looks:
+        b = a
+        reach = FACE_HAND
+    best = float(0.0)
+    if wp.abs(a) > FACE_HAND or wp.abs(b) > reach:
+        found = int(0)
+        b = a + wrapped(b - a)
+        for k in range(3):
+            for m in range(3):
+                hand = a + float(k - 1) * FULL_TURN
+                seen = b + float(k + m - 2) * FULL_TURN
+                low = wp.max(wp.max(hand - FACE_HAND, seen - reach), yaw_min - yaw)
+                high = wp.min(wp.min(hand + FACE_HAND, seen + reach), yaw_max - yaw)
+                x = wp.clamp(0.0, low, high)
+                if low <= high and (found == 0 or wp.abs(x) < wp.abs(best)):
+                    best = x
+                    found = 1
+    return best
+
+
+@wp.func
+def face_share(turn: float, hand_b: wp.vec3) -> float:
+    """How far (0..1) the turn `x` of `face_turn` is an objective: `yaw_dot* = sat(2 x, 0.8)` with the weight `w share`.
+
+    It grows with the square of `x` up to 0.3 rad: nothing happens while the base faces both points, and nothing abrupt
+    where it stops. The hand's own rows have `1 - 0.9 share` of their weight meanwhile: it waits for the base (less so
+    with a weight below 1).
+    """
+    share = wp.min(wp.abs(turn) / FACE_BAND, 1.0)
+    near = wp.min((hand_b[0] * hand_b[0] + hand_b[1] * hand_b[1]) / (FACE_NEAR * FACE_NEAR), 1.0)
+    return share * share * near
 
 
 @wp.func

@@ -16,6 +16,7 @@ from wbm.envs.episodes import Driver, EpisodeRunner, Frame, Record, StudentDrive
 from wbm.envs.perception import Perception
 from wbm.envs.world import GRASPS, WorldConfig, make_env, scene_rows, with_start
 from wbm.learning.router import RoutedTeacher, load_suite
+from wbm.learning.runtime_driver import RuntimeDriver
 from wbm.learning.student import load_student
 from wbm.robot.schema import PolicySchema
 from wbm.scenes.assets import load_assets
@@ -24,6 +25,8 @@ from wbm.sensors.config import SensorsConfig
 from wbm.sim.config import EVALUATE
 
 POLICY_KINDS = ("student", "teacher", "bundle")
+WITHHELD = {"both": (), "mask": ("text",), "text": ("depth_target",)}
+"""Fields of the observation that a condition withholds."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class BlockJob:
     """Everything that episodes `first` to `first + count - 1` depend on.
 
     Attributes:
-        kind: what `policy` holds, one of `POLICY_KINDS`.
+        kind: what `policy` holds, one of `POLICY_KINDS`. A bundle acts through its runtime, safety filter included.
         start: `whole_body`, or `local` at the pre-grasp.
         condition: what a student is given of its target: `both`, `mask` or `text`.
         record: episodes of lower number are also written as a dataset under `folder/episodes`.
@@ -74,8 +77,8 @@ class EvaluationWorld:
         physics = replace(EVALUATE, engine=job.world.sim.engine, threads=1)
         world = with_start(replace(job.world, sim=physics), job.start)
         rows = scene_rows(self.assets.scenes, job.split, KINDS, grasps)
-        self.env = make_env(self.assets, world, rows, job.num_envs, job.seed, job.device)
-        self.bank = self.assets.scenes.select(self.env.binding.scenes)
+        self.env = make_env(self.assets, world, rows, job.num_envs, job.seed, job.device, grasps=tuple(suite or ()))
+        self.bank = self.env.binding.bank.select(self.env.binding.scenes)
         phrasing = self.bank.text_held_out if job.split == "test" else self.bank.text
         self.sentence = phrasing[:, 0]
         perception, schema, texts = None, PolicySchema(), None
@@ -94,17 +97,20 @@ class EvaluationWorld:
         if job.kind == "teacher":
             return TeacherDriver(RoutedTeacher(suite, self.env))
         if job.kind == "bundle":
-            policy = Bundle.open(job.policy / "policy.wbm").policy()
-            act = lambda obs: policy({name: value.cpu().numpy() for name, value in obs.items()})
-        else:
-            student = load_student(job.policy, job.device)
-            if student.schema != self.schema:
-                raise ValueError(
-                    "the student was trained on other observations than sensors.* gives now "
-                    f"({student.schema.num_depth_points} and {student.schema.num_lidar_points} points)"
-                )
-            act = student.act
-        return StudentDriver(_conditioned(act, job.condition), self.env, self.schema)
+            bundle = Bundle.open(job.policy / "policy.wbm")
+            self._check_schema(bundle.contract.schema)
+            return RuntimeDriver(bundle, job.num_envs, WITHHELD[job.condition])
+        student = load_student(job.policy, job.device)
+        self._check_schema(student.schema)
+        return StudentDriver(_conditioned(student.act, job.condition), self.env, self.schema)
+
+    def _check_schema(self, schema: PolicySchema) -> None:
+        if schema != self.schema:
+            raise ValueError(
+                f"the {self.job.kind} was trained on other observations than sensors.* gives now: set "
+                f"sensors.depth_cloud.num_points={schema.num_depth_points} and "
+                f"sensors.lidar_cloud.num_points={schema.num_lidar_points}"
+            )
 
     def describe(self, record: Record) -> dict[str, Any]:
         """Fields of a recorded episode besides its steps."""
@@ -124,21 +130,28 @@ class EvaluationWorld:
     def row(self, record: Record) -> dict[str, Any]:
         """A record as the report reads it."""
         objects, scene = self.assets.objects, record.scene_index
+        name, family = str(objects.name[record.object_index]), str(objects.family[record.object_index])
         return {
             **record.to_dict(),
             "seed": record.episode,
-            "object": str(objects.family[record.object_index]),
-            "object_name": str(objects.name[record.object_index]),
+            # A folder of meshes without subfolders is no kind of object: there each is its own.
+            "object": name if family == "mesh" else family,
+            "object_name": name,
             "scene": KINDS[record.kind],
             "scene_row": int(self.env.binding.scenes[scene]),
             "instruction": str(self.assets.texts.sentence[self.sentence[scene]]),
             "reason": "" if record.success else record.reason,
+            **self._refusals(record.episode),
         }
+
+    def _refusals(self, episode: int) -> dict[str, Any]:
+        """What a bundle's runtime refused in an episode, by name; nothing for other policies."""
+        return {"refusals": dict(self.driver.refusals[episode])} if isinstance(self.driver, RuntimeDriver) else {}
 
 
 def _conditioned(act: Any, condition: str) -> Any:
     """The policy with the target mask or the instruction withheld."""
-    withheld = {"both": (), "mask": ("text",), "text": ("depth_target",)}[condition]
+    withheld = WITHHELD[condition]
     return lambda obs: act({name: value * 0 if name in withheld else value for name, value in obs.items()})
 
 

@@ -71,8 +71,8 @@ class RolloutWorld:
         world = replace(world, sim=replace(physics, engine=world.sim.engine, threads=1))
         rows = scene_rows(self.assets.scenes, "train", KINDS, tuple(g for g in GRASPS if g in suite))
         seed = job.seed + job.rollouts.seed_offset
-        self.env = make_env(self.assets, world, rows, job.rollouts.num_envs, seed, job.device)
-        self.bank = self.assets.scenes.select(self.env.binding.scenes)
+        self.env = make_env(self.assets, world, rows, job.rollouts.num_envs, seed, job.device, grasps=tuple(suite))
+        self.bank = self.env.binding.bank.select(self.env.binding.scenes)
         self.teacher = RoutedTeacher(suite, self.env)
         self.perception = Perception(
             self.env.robot,

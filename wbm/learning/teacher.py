@@ -18,6 +18,7 @@ from wbm.envs import rewards
 from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.outcome import REASONS, RUNNING
 from wbm.learning.config import PpoConfig, TeacherConfig
+from wbm.learning.curriculum import Curriculum
 from wbm.learning.curve import save_curve
 from wbm.learning.teacher_checkpoint import load_checkpoint, save_checkpoint
 from wbm.learning.teacher_evaluation import evaluate_teacher
@@ -83,15 +84,19 @@ def train_teacher(
     env.reset()
     alg = make_ppo(env, ppo)
     spec = teacher_spec(env, cfg, ppo)
+    curriculum = Curriculum(env, cfg.curriculum)
     curve: dict[str, list[float]] = {}
-    start, best, stale = load_checkpoint(scratch / "checkpoint.pt", alg, env, curve)
+    start, best, stale = load_checkpoint(scratch / "checkpoint.pt", alg, env, curriculum, curve)
     obs = env.obs
     writer = SummaryWriter(str(directory / "logs"), purge_step=start)
     began = time.monotonic()
     evaluation = curve["evaluation"][-1] if curve.get("evaluation") else float("nan")
 
     for iteration in range(start, cfg.iterations):
-        alg.entropy_coef = ppo.entropy * (1 - iteration / cfg.iterations)
+        left = 1 - iteration / cfg.iterations
+        alg.entropy_coef = ppo.entropy * left
+        if ppo.schedule == "linear":
+            _set_learning_rate(alg, ppo.lr * (ppo.lr_final + (1 - ppo.lr_final) * left))
 
         # Collect
         rewards_sum, terms, outcomes = 0.0, torch.zeros(len(rewards.TERMS)), torch.zeros(len(REASONS))
@@ -104,6 +109,8 @@ def train_teacher(
                 rewards_sum += reward.mean().item()
                 terms += info["terms"].mean(0).cpu()
                 outcomes += torch.bincount(info["outcome"].long(), minlength=len(REASONS)).cpu()
+                curriculum.count(info["scene"][done], info["outcome"][done])
+            curriculum.update()
             alg.compute_returns(_observation(obs))
 
         # Learn
@@ -140,7 +147,7 @@ def train_teacher(
             values.extend([float("nan")] * (iteration + 1 - len(values)))
 
         if (iteration + 1) % cfg.checkpoint_every == 0 or last:
-            save_checkpoint(scratch / "checkpoint.pt", alg, env, curve, iteration + 1, best, stale)
+            save_checkpoint(scratch / "checkpoint.pt", alg, env, curriculum, curve, iteration + 1, best, stale)
         if report is not None:
             done_now, elapsed = iteration + 1 - start, time.monotonic() - began
             pace = done_now * ppo.steps * env.num_envs / max(elapsed, 1e-9)
@@ -183,7 +190,7 @@ def make_ppo(env: GraspEnv, ppo: PpoConfig) -> PPO:
         learning_rate=ppo.lr,
         max_grad_norm=ppo.max_grad_norm,
         use_clipped_value_loss=ppo.clip_value,
-        schedule=ppo.schedule,
+        schedule="adaptive" if ppo.schedule == "adaptive" else "fixed",
         desired_kl=ppo.desired_kl,
         device=env.device,
     )
@@ -203,6 +210,12 @@ def teacher_spec(env: GraspEnv, cfg: TeacherConfig, ppo: PpoConfig) -> TeacherSp
         ppo.activation,
         env.period,
     )
+
+
+def _set_learning_rate(alg: PPO, rate: float) -> None:
+    alg.learning_rate = rate
+    for group in alg.optimizer.param_groups:
+        group["lr"] = rate
 
 
 def _observation(obs: torch.Tensor) -> TensorDict:

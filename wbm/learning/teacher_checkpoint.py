@@ -10,10 +10,18 @@ import torch
 from rsl_rl.algorithms import PPO
 
 from wbm.envs.grasp_env import GraspEnv
+from wbm.learning.curriculum import Curriculum
 
 
 def save_checkpoint(
-    path: Path, alg: PPO, env: GraspEnv, curve: dict[str, list[float]], iteration: int, best: float, stale: int
+    path: Path,
+    alg: PPO,
+    env: GraspEnv,
+    curriculum: Curriculum,
+    curve: dict[str, list[float]],
+    iteration: int,
+    best: float,
+    stale: int,
 ) -> None:
     """Write everything that the next iteration depends on, atomically."""
     state = {
@@ -21,6 +29,7 @@ def save_checkpoint(
         "learning_rate": alg.learning_rate,
         "rng": torch.get_rng_state(),
         "env": env.state_dict(),
+        "curriculum": curriculum.success,
         "curve": curve,
         "iteration": iteration,
         "best": best,
@@ -36,7 +45,9 @@ def save_checkpoint(
     os.replace(partial, path)
 
 
-def load_checkpoint(path: Path, alg: PPO, env: GraspEnv, curve: dict[str, list[float]]) -> tuple[int, float, int]:
+def load_checkpoint(
+    path: Path, alg: PPO, env: GraspEnv, curriculum: Curriculum, curve: dict[str, list[float]]
+) -> tuple[int, float, int]:
     """Restore a checkpoint where there is one; fills `curve`.
 
     Returns:
@@ -48,6 +59,7 @@ def load_checkpoint(path: Path, alg: PPO, env: GraspEnv, curve: dict[str, list[f
     alg.load(state, None, strict=True)
     alg.learning_rate = state["learning_rate"]
     env.load_state_dict(state["env"])
+    curriculum.success.copy_(state["curriculum"])
     torch.set_rng_state(state["rng"].cpu())
     curve.update(state["curve"])
     return state["iteration"], state["best"], state["stale"]

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from typing import Any
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+_PR_SET_PDEATHSIG = 1
 
 
 def run_jobs(module: str, jobs: Sequence[Any], workers: int) -> Iterator[Any]:
@@ -46,8 +49,16 @@ def run_jobs(module: str, jobs: Sequence[Any], workers: int) -> Iterator[Any]:
 
 
 def _quiet() -> None:
-    """Ctrl-C goes to the parent alone, which ends its workers."""
+    """Ctrl-C goes to the parent alone, which ends its workers; a parent that was killed takes them along (Linux).
+
+    Else a worker would go on writing its shard while the next run writes the same one.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        parent = multiprocessing.parent_process()
+        if parent is not None and parent.pid != os.getppid():
+            os._exit(1)  # it was killed before we asked to be told
     import torch
     import warp as wp
 

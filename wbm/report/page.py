@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 from collections.abc import Sequence
@@ -12,10 +11,11 @@ from typing import Any
 import jinja2
 
 from wbm.report.plots import curves_figure, failure_figure, figure4_panels, to_svg
-from wbm.report.stats import ARM_LABELS, PAPER_SUCCESS, overlap
+from wbm.report.stats import ARM_LABELS, PAPER_SUCCESS, percent, verdict
 from wbm.report.video import KEY_PHASES, data_uri
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
+_STYLE = Path(__file__).with_name("style.css")
 _OBJECTS_SHOWN = 12
 
 
@@ -69,14 +69,12 @@ def write_page(
         ("breakdown", "Breakdown", True),
         ("provenance", "Provenance", True),
     ]
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    html = environment.from_string(_TEMPLATE.read_text(encoding="utf-8")).render(
+    return render(
+        _TEMPLATE,
+        path,
         title=title,
         lead=_lead(result),
         r=result,
-        pct=percent,
         phases=KEY_PHASES,
         sections=[(key, name) for key, name, there in sections if there],
         notes=[*result.get("notes", []), *(note for item in figures for note in item["verdict"])],
@@ -94,25 +92,32 @@ def write_page(
         config=json.dumps(result["config"], indent=2, sort_keys=True) if result.get("config") else "",
         records=records,
     )
+
+
+def render(template: Path, path: Path, **values: Any) -> Path:
+    """Fill a template, which also gets `style` and `pct`, and write it whole or not at all; returns the path."""
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    style = _STYLE.read_text(encoding="utf-8")
+    html = environment.from_string(template.read_text(encoding="utf-8")).render(style=style, pct=percent, **values)
     partial = path.with_name(path.name + ".partial")
     partial.write_text(html, encoding="utf-8")
     os.replace(partial, path)
     return path
 
 
-def percent(value: float | None) -> str:
-    """A share as text: whole per cents, one digit near the ends, a dash for None."""
-    if value is None:
-        return "–"
-    digits = 1 if 0 < value < 0.02 or 0.98 < value < 1 else 0
-    return f"{100 * value:.{digits}f} %"
-
-
 def _lead(result: dict[str, Any]) -> str:
     policy = result.get("provenance", {}).get("policy", "The policy")
     where = result.get("config", {}).get("evaluation", {}).get("split")
     on = {"test": " that it has not been trained on", "train": " that it has been trained on"}.get(where, "")
-    return f"{policy} on {len(result['by_object'])} objects{on}, in {len(result['by_scene'])} kinds of scene."
+    count = len({r["object_name"] for r in result.get("records", []) if "object_name" in r})
+    what = (
+        f"{count} objects{on} ({', '.join(result['by_object'])})"
+        if count
+        else f"{len(result['by_object'])} objects{on}"
+    )
+    return f"{policy} on {what}, in {len(result['by_scene'])} kinds of scene ({', '.join(result['by_scene'])})."
 
 
 def _worst_first(groups: dict[str, Any]) -> dict[str, Any]:
@@ -162,21 +167,4 @@ def _figure4_item(item: dict[str, Any]) -> dict[str, Any]:
     name = item.get("name", "")
     panels = zip(("reward", "success"), figure4_panels(arms), strict=True)
     svgs = [to_svg(figure, f"Figure 4 {name} {what}") for what, figure in panels if figure is not None]
-    return {"name": name, "note": item.get("note", ""), "arms": arms, "svgs": svgs, "verdict": _verdict(name, arms)}
-
-
-def _verdict(name: str, arms: Sequence[dict[str, Any]]) -> list[str]:
-    """What the intervals say about the paper's order, in words."""
-    by_key = {a["key"]: a for a in arms}
-    if not {"full", "no_active_vision", "joint_space"} <= set(by_key):
-        return []
-    ranked = sorted(arms, key=lambda a: -a["success_rate"])
-    order = ", ".join(f"{a['label'].lower()} {percent(a['success_rate'])}" for a in ranked)
-    expected = [a["key"] for a in ranked] == list(PAPER_SUCCESS)
-    apart = not any(overlap(a["success_ci95"], b["success_ci95"]) for a, b in itertools.pairwise(ranked))
-    lead = f"{name}: {order}." if name else f"{order.capitalize()}."
-    if expected and apart:
-        return [f"{lead} The order is the paper's and the intervals are apart."]
-    if expected:
-        return [f"{lead} The order is the paper's, but some intervals overlap, so it is not settled by these episodes."]
-    return [f"{lead} This is not the order that the paper reports."]
+    return {"name": name, "note": item.get("note", ""), "arms": arms, "svgs": svgs, "verdict": verdict(name, arms)}

@@ -53,8 +53,11 @@ _STYLE: Any = {
 }
 
 
-def to_svg(figure: Figure, label: str) -> str:
-    """Inline SVG that scales to its container; `label` is read out by screen readers. Same figure, same text."""
+def to_svg(figure: Figure, label: str, standalone: bool = False) -> str:
+    """Inline SVG that scales to its container; `label` is read out by screen readers. Same figure, same text.
+
+    With `standalone` it is a file of its own: fixed inks on white.
+    """
     buffer = io.StringIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(
@@ -62,7 +65,7 @@ def to_svg(figure: Figure, label: str) -> str:
         )
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
-    for stand_in, variable in _VARIABLES.items():
+    for stand_in, variable in (_PRINT if standalone else _VARIABLES).items():
         svg = svg.replace(stand_in, variable)
     svg = re.sub(r"font: (?:[\w.]+ )*?([\d.]+)px [^;\"]*", r"font: \1px var(--font, sans-serif)", svg)
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S)
@@ -73,7 +76,9 @@ def to_svg(figure: Figure, label: str) -> str:
     svg = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}-\1"', svg)
     title = label.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
     width, height = (float(re.search(rf'{side}="([\d.]+)pt"', svg).group(1)) for side in ("width", "height"))  # type: ignore[union-attr]
-    head = f'<svg role="img" aria-label="{title}" style="width:100%;height:auto;max-width:{width * 4 / 3:.0f}px" '
+    ground = "background:#fff;" if standalone else ""
+    size = f"width:100%;height:auto;max-width:{width * 4 / 3:.0f}px"
+    head = f'<svg role="img" aria-label="{title}" style="{ground}{size}" '
     svg = re.sub(r'(width|height)="[\d.]+pt" ', "", svg, count=2)
     assert height > 0
     return svg.replace("<svg ", head, 1)
@@ -159,14 +164,20 @@ def draw_success(ax: Axes, arms: Sequence[dict[str, Any]]) -> None:
 def figure4(arms: Sequence[dict[str, Any]], title: str = "") -> Figure:
     """The paper's Figure 4 in one picture: (a) training reward with bands, (b) lifting success with intervals.
 
+    Without curves only (b) is drawn.
+
     Args:
         arms: dictionaries with `key`, `success_rate`, `success_ci95`, and `curve` (`steps`, `values` [seeds][steps]).
         title: heading over both panels.
     """
+    curves = _arm_curves(arms)
     with matplotlib.rc_context(_STYLE):
-        figure, (left, right) = _figure(9.6, 3.7, 2, width_ratios=(1.35, 1))
-        draw_curves(left, _arm_curves(arms), ARM_COLOURS, "environment steps", "reward")
-        left.set_title("(a) Training reward")
+        if curves:
+            figure, (left, right) = _figure(9.6, 3.7, 2, width_ratios=(1.35, 1))
+            draw_curves(left, curves, ARM_COLOURS, "environment steps", "reward a step")
+            left.set_title("(a) Training reward")
+        else:
+            figure, right = _figure(4.4, 3.7)
         draw_success(right, arms)
         right.set_title("(b) Lifting success")
         if title:
@@ -180,7 +191,7 @@ def figure4_panels(arms: Sequence[dict[str, Any]]) -> tuple[Figure | None, Figur
         left = None
         if curves := _arm_curves(arms):
             left, ax = _figure(4.9, 3.4)
-            draw_curves(ax, curves, ARM_COLOURS, "environment steps", "reward")
+            draw_curves(ax, curves, ARM_COLOURS, "environment steps", "reward a step")
             ax.set_title("(a) Training reward")
         right, ax = _figure(4.1, 3.4)
         draw_success(ax, arms)
@@ -192,11 +203,11 @@ def _arm_curves(arms: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {a["key"]: a["curve"] for a in arms if a.get("curve")}
 
 
-def curves_figure(curves: dict[str, dict[str, Any]], ylabel: str) -> Figure:
+def curves_figure(curves: dict[str, dict[str, Any]], ylabel: str, xlabel: str = "steps") -> Figure:
     """Training curves of one quantity."""
     with matplotlib.rc_context(_STYLE):
         figure, ax = _figure(4.9, 3.0)
-        draw_curves(ax, curves, ARM_COLOURS, "steps", ylabel)
+        draw_curves(ax, curves, ARM_COLOURS, xlabel, ylabel)
     return figure
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -96,3 +97,34 @@ def _share(flags: Iterable[bool]) -> float:
 def overlap(a: Sequence[float], b: Sequence[float]) -> bool:
     """Whether two intervals have a point in common."""
     return a[0] <= b[1] and b[0] <= a[1]
+
+
+def percent(value: float | None) -> str:
+    """A share as text: whole per cents, one digit near the ends, a dash for None."""
+    if value is None:
+        return "–"
+    digits = 1 if 0 < value < 0.02 or 0.98 < value < 1 else 0
+    return f"{100 * value:.{digits}f} %"
+
+
+def verdict(name: str, arms: Sequence[dict[str, Any]]) -> list[str]:
+    """What the intervals say about the paper's order, in words: one sentence, or none where an arm is missing.
+
+    Args:
+        name: what is compared.
+        arms: dictionaries with `key`, `label`, `success_rate`, `success_ci95`.
+    """
+    by_key = {a["key"]: a for a in arms}
+    if not {"full", "no_active_vision", "joint_space"} <= set(by_key):
+        return []
+    ranked = sorted(arms, key=lambda a: -a["success_rate"])
+    order = ", ".join(f"{a['label'].lower()} {percent(a['success_rate'])}" for a in ranked)
+    rates = [by_key[key]["success_rate"] for key in PAPER_SUCCESS]
+    expected = all(better > worse for better, worse in itertools.pairwise(rates))
+    apart = not any(overlap(a["success_ci95"], b["success_ci95"]) for a, b in itertools.pairwise(ranked))
+    lead = f"{name}: {order}." if name else f"{order.capitalize()}."
+    if expected and apart:
+        return [f"{lead} The order is the paper's and the intervals are apart."]
+    if expected:
+        return [f"{lead} The order is the paper's, but some intervals overlap, so it is not settled by these episodes."]
+    return [f"{lead} This is not the order that the paper reports."]

@@ -83,10 +83,10 @@ def follow_camera(
 
 
 def inset(frame: np.ndarray, small: np.ndarray, margin: int = 8) -> np.ndarray:
-    """`frame` with `small` and a thin border in its upper right corner."""
+    """`frame` with `small` and a thin border in its lower right corner, where the floor is."""
     h, w = small.shape[:2]
     result = frame.copy()
-    top, left = margin, frame.shape[1] - w - margin
+    top, left = frame.shape[0] - h - margin, frame.shape[1] - w - margin
     result[top - 2 : top + h + 2, left - 2 : left + w + 2] = 245
     result[top : top + h, left : left + w] = small
     return result
@@ -101,6 +101,7 @@ def film_frame(
     camera: tuple[np.ndarray, np.ndarray],
     size: tuple[int, int],
     camera_fov_deg: float = 58.0,
+    render_own: RenderRgb | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Outer view with the robot's own view set in, and that own view alone.
 
@@ -112,6 +113,7 @@ def film_frame(
         camera: pose (position, optical quaternion) of the robot's camera in W.
         size: width and height of the outer view, pixels.
         camera_fov_deg: vertical field of view of the robot's camera.
+        render_own: renderer of the own view, by default the same; it may leave the camera's housing out.
 
     Returns:
         Outer view with inset [H,W,3] and own view [H/3,W/3,3], uint8.
@@ -119,7 +121,7 @@ def film_frame(
     width, height = size
     eye, quat = follow_camera(base_pos, target_pos)
     outer = render_rgb(scene, env, eye, quat, width, height, 42.0)
-    own = render_rgb(scene, env, *camera, width // 3, height // 3, camera_fov_deg)
+    own = (render_own or render_rgb)(scene, env, *camera, width // 3, height // 3, camera_fov_deg)
     return inset(outer, own), own
 
 

@@ -209,24 +209,34 @@ class PolicySchema:
         return replace(self, num_depth_points=depth, num_lidar_points=lidar)
 
 
-def rot6d(rot: np.ndarray) -> np.ndarray:
-    """First two columns of rotation matrices [...,3,3] as [...,6]: a continuous representation (Zhou et al. 2019)."""
-    return np.concatenate([rot[..., :, 0], rot[..., :, 1]], axis=-1)
+def to_increment(xp: Any, q: Any, q_target: Any, spec: ActionSpec) -> Any:
+    """Action [...,32] that moves `q` [...,32] to `q_target`: the inverse of `to_target`, clipped to the limit.
 
-
-def to_increment(q: np.ndarray, q_target: np.ndarray, spec: ActionSpec) -> np.ndarray:
-    """Action [...,32] that moves `q` [...,32] to `q_target`: the inverse of `to_target`, clipped to the limit."""
+    Args:
+        xp: numpy or torch.
+        q, q_target: measured joints and joint targets, m or rad, of the same dtype.
+        spec: scale and limit of the action.
+    """
     delta = q_target - q
-    c, s = np.cos(q[..., 2]), np.sin(q[..., 2])
-    dx, dy = delta[..., 0].copy(), delta[..., 1].copy()
-    delta[..., 0], delta[..., 1] = c * dx + s * dy, -s * dx + c * dy
-    return np.clip(delta / np.asarray(spec.scale), -spec.limit, spec.limit)
+    c, s = xp.cos(q[..., 2]), xp.sin(q[..., 2])
+    x, y = delta[..., 0], delta[..., 1]
+    delta_b = xp.concatenate([xp.stack([c * x + s * y, c * y - s * x], -1), delta[..., 2:]], -1)
+    return xp.clip(delta_b / _scale(xp, q, spec), -spec.limit, spec.limit)
 
 
-def to_target(q: np.ndarray, action: np.ndarray, spec: ActionSpec) -> np.ndarray:
-    """Joint targets [...,32] of an action [...,32] at joint positions `q` [...,32]; base increments are in B."""
-    delta = np.clip(action, -spec.limit, spec.limit) * np.asarray(spec.scale)
-    c, s = np.cos(q[..., 2]), np.sin(q[..., 2])
-    dx, dy = delta[..., 0].copy(), delta[..., 1].copy()
-    delta[..., 0], delta[..., 1] = c * dx - s * dy, s * dx + c * dy
-    return q + delta
+def to_target(xp: Any, q: Any, action: Any, spec: ActionSpec) -> Any:
+    """Joint targets [...,32] of an action [...,32] at joint positions `q` [...,32]; base increments are in B.
+
+    Args:
+        xp: numpy or torch.
+        q, action: of the same dtype; the action is clipped to the limit.
+        spec: scale and limit of the action.
+    """
+    delta_b = xp.clip(action, -spec.limit, spec.limit) * _scale(xp, q, spec)
+    c, s = xp.cos(q[..., 2]), xp.sin(q[..., 2])
+    x, y = delta_b[..., 0], delta_b[..., 1]
+    return q + xp.concatenate([xp.stack([c * x - s * y, s * x + c * y], -1), delta_b[..., 2:]], -1)
+
+
+def _scale(xp: Any, like: Any, spec: ActionSpec) -> Any:
+    return xp.asarray(spec.scale, dtype=like.dtype, device=like.device)

@@ -70,7 +70,7 @@ class ScenesConfig:
     """How scenes are drawn.
 
     Attributes:
-        count: scenes of every kind (per split: `count` for train, `test_count` for test, a tenth of count for val).
+        count: scenes of every kind (per split: `count` for train, `test_count` for test, a fifth of count for val).
         test_count: scenes of every kind on test objects.
         kinds: `table`, `shelf`, `bin`.
         num_distractors: free bodies besides the target that the compiled model holds.

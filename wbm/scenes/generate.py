@@ -31,7 +31,7 @@ def wanted(cfg: ScenesConfig, objects: ObjectSet) -> dict[str, int]:
     """
     if not (objects.split == "train").any():
         raise ValueError(f"scenes: none of the {len(objects)} objects is for training; add objects or change the seed")
-    count = {"train": cfg.count, "val": max(1, cfg.count // 10), "test": cfg.test_count}
+    count = {"train": cfg.count, "val": max(1, cfg.count // 5), "test": cfg.test_count}
     return {s: count[s] for s in SPLITS if count[s] > 0 and (objects.split == s).any()}
 
 

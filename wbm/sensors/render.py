@@ -46,8 +46,11 @@ class Renderer:
         self._sensors: tuple[RaySensor, RaySensor] | None = None
         self._shape: tuple = ()
 
-    def draw(self, scene: RayScene, env: int, pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    def draw(self, scene: RayScene, env: int, pos: np.ndarray, quat: np.ndarray, exclude_body: int = -1) -> np.ndarray:
         """Image [H,W,3] uint8 of environment `env` from the optical frame at `pos` [3], `quat` [4] (w x y z).
+
+        Args:
+            exclude_body: body that is not drawn: the camera's own, for a camera inside its housing (-1: none).
 
         Raises:
             ValueError: an environment out of range or a pose that is not finite.
@@ -56,6 +59,7 @@ class Renderer:
         if not (np.isfinite(pos).all() and np.isfinite(quat).all()):
             raise ValueError("renderer: the camera's pose is not finite")
         camera, light = self._bind(scene)
+        camera.exclude_body = exclude_body
         camera.scene.copy_envs(scene, [env])
         light.scene.copy_envs(scene, [env] * len(self._lights))
         camera.pos.assign(pos[None].astype(np.float32))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,20 +30,22 @@ class RuntimeDriver:
     Args:
         bundle: the policy.
         num_envs: number of environments.
+        withheld: fields of the observation that are given as zeros.
 
     Attributes:
-        refusals: how often a reading or a target was refused, by name.
+        refusals: how often a reading or a target was refused in an episode, by its number and by name.
     """
 
     needs_sight = True
 
-    def __init__(self, bundle: Bundle, num_envs: int) -> None:
+    def __init__(self, bundle: Bundle, num_envs: int, withheld: Collection[str] = ()) -> None:
+        self._withheld = frozenset(withheld)
         self._runtimes = [PolicyRuntime(bundle) for _ in range(num_envs)]
         self._kinematics = Kinematics(bundle.contract)
         self._dt, self._names = bundle.contract.dt, bundle.contract.joint_names
         self._episode = np.full(num_envs, -1)
         self._target = np.zeros((num_envs, len(self._names)))
-        self.refusals: Counter[str] = Counter()
+        self.refusals: defaultdict[int, Counter[str]] = defaultdict(Counter)
 
     def step(self, env: GraspEnv, sight: Sight | None) -> tuple[Tensor, Tensor, Tensor, dict]:
         """One policy step of every environment; returns what `GraspEnv.step_targets` returns."""
@@ -50,7 +53,7 @@ class RuntimeDriver:
         targets = self.targets(
             env.state.q.double().cpu().numpy(),
             env.state.qd.double().cpu().numpy(),
-            {name: values.cpu().numpy() for name, values in sight.obs.items()},
+            {n: (v * 0 if n in self._withheld else v).cpu().numpy() for n, v in sight.obs.items()},
             env.episode.cpu().numpy(),
             env.elapsed.cpu().numpy(),
         )
@@ -77,7 +80,7 @@ class RuntimeDriver:
                 reading = self._reading(q[i], qd[i], {k: v[i] for k, v in obs.items()}, now)
                 self._target[i] = runtime.step(reading, now).q_target
             except Refused as refused:
-                self.refusals[refused.fault.value] += 1
+                self.refusals[int(episode[i])][refused.fault.value] += 1
                 runtime.recover()
         return self._target
 

@@ -1,0 +1,15 @@
+"""Which of the processes that share one piece of work this one is."""
+
+from __future__ import annotations
+
+import os
+
+
+def rank() -> int:
+    """Number of this process among those of a job; 0 writes the results."""
+    return int(os.environ.get("RANK", "0"))
+
+
+def world_size() -> int:
+    """How many processes share the work."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
