@@ -11,6 +11,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from stages.cli import main
 from wbm.scenes import cache, decompose, isolate, meshfile, parts, sources
 from wbm.scenes.config import ObjectsConfig
 from wbm.scenes.meshfile import MeshError
@@ -294,3 +295,19 @@ def test_families_are_held_out_where_folders_name_them():
 )
 def test_nouns_come_from_file_names_without_colours_and_sizes(stem, noun):
     assert sources.noun_of(stem) == noun
+
+
+def test_the_stage_fails_where_most_meshes_do_and_notices_a_changed_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def wbm(*arguments):
+        with pytest.raises(SystemExit) as stop:
+            main([*arguments, "objects=meshes", f"objects.path={folder_with(tmp_path, bad=6)}"])
+        return stop.value.code, *capsys.readouterr()
+
+    code, _, err = wbm("prepare-assets")
+    assert code == 1 and "6 of 10 meshes" in err and "broken_0.obj" in err and "Traceback" not in err
+    before = json.loads(wbm("plan", "--until", "prepare-assets", "--json")[1])["stages"][0]["key"]
+    assert json.loads(wbm("plan", "--until", "prepare-assets", "--json")[1])["stages"][0]["key"] == before
+    SOLID.copy().apply_scale(1.01).export(tmp_path / "meshes" / "kind0" / "more.obj")
+    assert json.loads(wbm("plan", "--until", "prepare-assets", "--json")[1])["stages"][0]["key"] != before

@@ -22,7 +22,7 @@ def folder(tmp_path_factory):
 def test_the_gallery_stands_on_the_floor_in_front_of_the_robot(folder):
     objects = small_objects()
     tracks = gallery_tracks(Assets(objects, small_bank(), Texts(np.array([]), np.zeros((0, 384)))))
-    assert [s.name for s in tracks.solids] == list(objects.name)
+    assert [s.id for s in tracks.solids] == list(objects.name)
     np.testing.assert_allclose(tracks.q[0], small_model().robot.q_home)
     low = [float((rotate(s.quat, s.vertices) + s.pos)[:, 2].min()) for s in tracks.solids]
     np.testing.assert_allclose(low, 0.0, atol=2e-3)
