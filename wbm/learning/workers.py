@@ -46,8 +46,9 @@ def run_jobs(module: str, jobs: Sequence[Any], workers: int) -> Iterator[Any]:
 
 
 def _quiet() -> None:
-    """Ctrl-C goes to the parent alone, which ends its workers."""
+    """Ctrl-C and Slurm's warning go to the parent alone, which ends its workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGUSR2, signal.SIG_IGN)
     import torch
     import warp as wp
 
