@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
@@ -36,7 +38,7 @@ class MujocoWarpSimulation(Simulation):
         self.model, self.num_envs, self.device = model, num_envs, device
         self._device = wp.get_device(device)
         with wp.ScopedDevice(self._device):
-            self._m = mjw.put_model(model)
+            self._m = mjw.put_model(_without_midphase(model))
             self._d = mjw.make_data(model, nworld=num_envs, nconmax=CONTACTS, njmax=ROWS)
         self._fields: dict[str, torch.Tensor] = {}
         self._states: dict[str, torch.Tensor] = {}
@@ -130,3 +132,10 @@ class MujocoWarpSimulation(Simulation):
     def _run(self, function) -> None:
         with wp.ScopedDevice(self._device):
             function(self._m, self._d)
+
+
+def _without_midphase(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The same model without the flag that switches MuJoCo C's midphase off: there is none here to switch off."""
+    plain = copy.copy(model)
+    plain.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+    return plain
