@@ -7,16 +7,19 @@ ARGS ?=
 EXTRAS := dev,view,slurm,gpu,objects,bench
 # A package index for torch, for example https://download.pytorch.org/whl/cpu on machines without a GPU
 TORCH_INDEX ?=
+install_torch = $(1) install --quiet -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX),) torch==2.13.0
+# The newest bundle, when the command runs
+BUNDLE = $$(ls -t $(CURDIR)/artifacts/bundle/*/*/policy.wbm | head -1)
 
 WBM := $(BIN)/wbm
 WBM_ARGS = profile=$(PROFILE) $(ARGS)
 include wbm.mk
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check format bench pipeline ci wheel-test clean
+.PHONY: help setup run test check format bench pipeline ci dist wheel-test clean
 
 help:
-	@echo "make setup | run | test | check | format | bench | pipeline PROFILE=laptop | ci | clean"
+	@echo "make setup | run | test | check | format | bench | pipeline PROFILE=laptop | dist | ci | clean"
 	@echo "make assets | teachers | rollouts | student | evaluation | bundle    (PROFILE=..., ARGS='seed=1 ...')"
 
 setup: $(VENV)/.installed
@@ -24,7 +27,7 @@ setup: $(VENV)/.installed
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX),) torch==2.13.0
+	$(call install_torch,$(BIN)/pip)
 	$(BIN)/pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
 
@@ -56,13 +59,22 @@ ci: check test
 	$(WBM) artifacts verify
 	$(MAKE) wheel-test
 
-# The built wheel alone, in an empty environment, outside the checkout.
-wheel-test: setup
+# The source archive, and the wheel that is built from it.
+dist: setup
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation --outdir dist .
+
+# The wheel in an empty environment, outside the checkout; then the runtime where a robot has NumPy and ONNX Runtime alone.
+wheel-test: dist
 	rm -rf build/wheel && mkdir -p build/wheel
-	$(BIN)/python -m build --wheel --no-isolation --outdir build/wheel/dist .
 	$(PYTHON) -m venv build/wheel/venv
-	build/wheel/venv/bin/pip install --quiet -c constraints.txt build/wheel/dist/*.whl
-	cd build/wheel && venv/bin/wbm plan profile=smoke && venv/bin/wbm run profile=smoke
+	$(call install_torch,build/wheel/venv/bin/pip)
+	build/wheel/venv/bin/pip install --quiet -c constraints.txt dist/*.whl
+	cd build/wheel && venv/bin/wbm doctor && venv/bin/wbm plan && venv/bin/wbm run --until prepare-assets
+	$(PYTHON) -m venv build/wheel/robot
+	build/wheel/robot/bin/pip install --quiet -c constraints.txt numpy onnxruntime
+	build/wheel/robot/bin/pip install --quiet --no-deps dist/*.whl
+	cd build/wheel && robot/bin/python -m wbm.deploy verify $(BUNDLE)
 
 clean:
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis

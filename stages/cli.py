@@ -181,13 +181,16 @@ def doctor(overrides: Overrides = None, debug: Debug = False, as_json: Json = Fa
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="sensors, data, student or all.")],
-    overrides: Overrides = None,
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="wbc, sensors, env, data, student or all.")],
+    settings: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME=VALUE]...", help="Sizes of one suite: steps=1000000.", show_default=False),
+    ] = None,
     debug: Debug = False,
     as_json: Json = False,
 ) -> None:
     """The project's own benchmarks beside the peers."""
-    _call("bench", "bench", suite, overrides or [], as_json)
+    _call("bench", "bench", suite, settings or [], as_json)
 
 
 @app.command()
@@ -409,19 +412,29 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code)
 
 
+_TOLD = (
+    "StageError", "Interrupted", "FactsError", "ArtifactError", "Missing", "Conflict", "LaunchError", "BundleError",
+    "Refused",
+)  # fmt: skip
+"""Errors whose text says what, where and what to do."""
+
+
 def _exit_code(error: BaseException) -> int:
     kind = type(error).__name__
     if hasattr(error, "exit_code") and hasattr(error, "format_message"):  # a usage error of Typer
-        return _complain(error.format_message(), 2)  # pyright: ignore[reportAttributeAccessIssue]
+        text: str = error.format_message().rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
+        path = getattr(getattr(error, "ctx", None), "command_path", "wbm")
+        return _complain(f"{text}; see `{path} --help`", 2)
     if kind == "Abort":
         return _complain("interrupted", 1)
     if kind == "ConfigError":
         return _complain(str(error), 2)
-    if kind in ("StageError", "FactsError", "Interrupted", "ArtifactError", "Missing", "Conflict", "LaunchError"):
+    if kind in _TOLD:
         return _complain(str(error), 1)
     text = " ".join(str(error).split())
-    hint = "" if isinstance(error, OSError) else "; add --debug for the traceback"
-    return _complain(f"{kind}: {text}{hint}", 1)
+    if isinstance(error, OSError):
+        return _complain(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else text, 1)
+    return _complain(f"{text if kind == 'ValueError' else f'{kind}: {text}'}; add --debug for the traceback", 1)
 
 
 def _complain(message: str, code: int) -> int:

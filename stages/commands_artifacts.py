@@ -33,9 +33,10 @@ def split(items: Sequence[str], count: int | None = None) -> tuple[Store, list[s
     store = open_store(composer([item for item in items if "=" in item]))
     names = [item for item in items if "=" not in item]
     if (count == -1 and not names) or (count is not None and count >= 0 and len(names) != count):
-        raise ConfigError(
-            f"name {'at least one artifact' if count == -1 else f'{count} artifacts'}, as kind/name[/key]"
+        wanted = {-1: "at least one artifact", 0: "no artifact", 1: "one artifact"}.get(
+            count or 0, f"{count} artifacts"
         )
+        raise ConfigError(f"name {wanted}, as kind/name[/key]; `wbm artifacts ls` lists them")
     return store, names
 
 
@@ -303,6 +304,8 @@ def rm(items: Sequence[str], force: bool, as_json: bool) -> None:
 
 def transfer(url: str, items: Sequence[str], push: bool, as_json: bool) -> None:
     """Copy artifacts with all their inputs between this store and another one; without a name, everything."""
+    if "=" in url:
+        raise ConfigError(f"{url}: name the other store first, as s3://bucket/prefix or a directory")
     store, names = split(items)
     other = Store.open(url)
     source, target = (store, other) if push else (other, store)

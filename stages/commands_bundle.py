@@ -23,7 +23,7 @@ def show(path: str, overrides: Sequence[str], as_json: bool) -> None:
     """Print what a person wants to know first.
 
     Raises:
-        FileNotFoundError: there is no bundle.
+        ConfigError: there is no bundle.
         BundleError: it is damaged; the message names the part.
     """
     _print(_open(path, overrides).show(), as_json)
@@ -38,11 +38,13 @@ def replay_log(log: str, path: str, overrides: Sequence[str], as_json: bool) -> 
     """Run a bundle on the observations of a log and print how far its actions are from those that were logged.
 
     Raises:
-        FileNotFoundError: there is no log or no bundle.
+        ConfigError: there is no log or no bundle.
         ValueError: the log holds no observations, or those of another schema.
     """
     from wbm.deploy.log import replay
 
+    if not Path(log).is_file():
+        raise ConfigError(f"{log}: no such file; name a log that RunLog or `wbm bundle soak --log FILE` wrote")
     _print(replay(log, _open(path, overrides)), as_json)
 
 
@@ -89,9 +91,11 @@ def compare(overrides: Sequence[str], as_json: bool) -> None:
 def _open(path: str, overrides: Sequence[str]) -> Bundle:
     from wbm.deploy.bundle import Bundle
 
-    place, config = Path(path), composer(overrides)
+    place = Path(path)
     if not place.exists() and (path.startswith("bundle/") or is_reference(path)):
-        place = open_store(config).resolve(path, ("bundle",)).path
+        place = open_store(composer(overrides)).resolve(path, ("bundle",)).path
+    if not place.exists():
+        raise ConfigError(f"{path}: no such file; name a bundle's file, its folder, or bundle/NAME in the store")
     return Bundle.open(place / "policy.wbm" if place.is_dir() else place)
 
 

@@ -18,6 +18,7 @@ from stages.convert import ConfigError
 from stages.pipeline import StageError, run_node
 from stages.plan import Node, bare_node
 from stages.progress import Progress
+from stages.reasons import because
 from stages.tables import seconds, table
 from wbm.artifacts.errors import ArtifactError, Conflict
 from wbm.artifacts.store import Store
@@ -227,7 +228,7 @@ def _state(entry: dict[str, Any]) -> str:
         return f"done in {seconds(entry['seconds'])}"
     if entry["state"] == "started":
         return f"iteration {entry['iteration']} of {entry['iterations']}"
-    return f"to do {planning.because(entry['reasons'])}"
+    return f"to do {because(entry['reasons'])}"
 
 
 def _success(entry: dict[str, Any]) -> str:

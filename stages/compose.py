@@ -81,8 +81,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         try:
             parsed += parser.parse_overrides([line])
         except HydraException as error:
-            reason = str(error).splitlines()[0].removesuffix(".")
-            raise ConfigError(f"cannot read override '{line}' ({reason}); write key=value") from error
+            raise ConfigError(f"cannot read override '{line}'; write key=value, without spaces") from error
     return parsed
 
 

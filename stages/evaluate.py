@@ -172,7 +172,9 @@ def _film(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any, records: 
             for i, info in enumerate(reader.episodes):
                 target = draft.path / "mcap" / f"episode-{info.seed:04d}.mcap"
                 target.parent.mkdir(exist_ok=True)
-                write_episode_mcap(target, reader.read_episode(i), schema, scene_solids(assets, int(info.scene)))
+                episode = reader.read_episode(i)
+                solids = scene_solids(assets, int(info.scene), np.asarray(episode["p_obj_w"], dtype=np.float64))
+                write_episode_mcap(target, episode, schema, solids)
 
 
 def _curves(curve: Any, kind: str) -> dict[str, Any]:
@@ -193,9 +195,10 @@ def _block(folder: Path, first: int) -> Path:
 
 
 def _plain(settings: Any) -> dict[str, Any]:
-    from dataclasses import asdict
+    """Settings that a result depends on; the number of processes is none."""
+    from wbm.artifacts.digest import plain
 
-    return asdict(settings)
+    return plain(settings, key_only=True)
 
 
 def _write(path: Path, value: Any) -> None:

@@ -24,14 +24,13 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
         draft: the artifact being written.
         progress: offers `message`.
     """
-    from dataclasses import asdict
-
+    from wbm.artifacts.digest import plain
     from wbm.report.figure4 import Run, gather, write_figure4
 
     runs = [_read(slot, artifact) for slot, artifact in sorted(inputs.items())]
     figure = gather([Run(**run) for run in runs])
     provenance = {slot: artifact.manifest.ref for slot, artifact in sorted(inputs.items())}
-    config = {"seed": cfg.seed, "figure4": asdict(cfg.figure4)}
+    config = {"seed": cfg.seed, "figure4": plain(cfg.figure4, key_only=True)}
     write_figure4(draft.path, figure, config, provenance)
     for reading in figure["readings"]:
         for arm in reading["arms"]:

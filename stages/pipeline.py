@@ -179,6 +179,9 @@ def _failure(node: Node, draft: Draft, error: Exception) -> Exception:
     if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
         draft.keep()
         return StageError(f"{node.stage.name}: no disk space left at {draft.path}; free some and run again to continue")
+    if isinstance(error, FileNotFoundError):  # a setting that names no file: trying again would not help
+        draft.keep()
+        return StageError(f"{node.stage.name}: {_text(error)}")
     if isinstance(error, (OSError, MemoryError, BrokenExecutor)):
         draft.keep()
         return StageError(f"{node.stage.name}: {_text(error)}; finished parts are kept, run again to continue")

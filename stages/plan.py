@@ -242,9 +242,7 @@ def _node(
             else:
                 node.upstream[name] = other
         if not matches:
-            raise ConfigError(
-                f"{stage.name}: no stage makes its input '{slot.name}'; set inputs.{slot.name}=KIND/NAME"
-            )
+            raise ConfigError(f"{stage.name}: no stage makes its input '{slot.name}'; set inputs.{slot.name}=KIND/NAME")
     return node
 
 

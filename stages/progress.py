@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from wbm.launch.stop import Stopped
 
@@ -96,7 +96,11 @@ class Progress:
             Stopped: the run was asked to stop.
         """
         if self.stopping():
-            raise Stopped("asked to stop")
+            self.stop()
+
+    def stop(self) -> NoReturn:
+        """End the run here; what it has done is kept."""
+        raise Stopped("asked to stop")
 
     def message(self, text: str) -> None:
         """Print a line on standard error, above the bars."""

@@ -36,6 +36,7 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
 
     from wbm.envs.world import WorldConfig, make_env, scene_rows, with_start
     from wbm.learning.teacher import Progress, train_teacher
+    from wbm.learning.team import Team
     from wbm.scenes.assets import load_assets
     from wbm.sim.config import evaluation_physics
 
@@ -52,7 +53,8 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
         progress.message(f"no {teacher.eval_split} scene for {teacher.name}: evaluating on {teacher.split} scenes")
         held_out = rows
     progress.message(f"{teacher.name}: {len(rows)} scenes to learn on, {len(held_out)} to evaluate on")
-    env = make_env(assets, world, rows, teacher.num_envs, cfg.seed, device)
+    team = Team.join(device)
+    env = make_env(assets, world, rows, team.share(teacher.num_envs), cfg.seed, device)
     eval_env = make_env(assets, judge, held_out, teacher.eval_envs, cfg.seed + 1, device)
 
     with progress.task(f"teacher {teacher.name}", total=teacher.iterations) as task:
@@ -64,14 +66,18 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
                 progress.message(f"  going on after iteration {p.iteration - 1}")
             task.update(p.iteration - shown, reward=p.reward, success=p.success, evaluation=p.evaluation)
             shown = p.iteration
-            progress.safe_point()
             if p.iteration % teacher.eval_every == 0:
                 progress.message(
                     f"  iteration {p.iteration}/{p.iterations}: success {p.success:.2f}, "
                     f"deterministic {p.evaluation:.2f}, "
                     f"{p.steps_per_s:.0f} steps/s, {p.time_left_s / 60:.0f} min left"
                 )
+            if p.stopping:
+                progress.stop()
 
-        metrics = train_teacher(env, eval_env, teacher, cfg.ppo, draft.path, draft.scratch, cfg.seed, report)
+        metrics = train_teacher(
+            env, eval_env, teacher, cfg.ppo, draft.path, draft.scratch, cfg.seed, report, team, progress.stopping
+        )
+    team.leave()
     draft.seeds["teacher"] = cfg.seed
     draft.metrics |= metrics

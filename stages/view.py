@@ -1,4 +1,4 @@
-"""`wbm view`: open a rollout, an evaluation's episodes, the scenes of assets, or the robot in the web viewer."""
+"""`wbm view`: rollouts, an evaluation's episodes, a live policy, the scenes of assets, or the robot in a browser."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ if TYPE_CHECKING:
     from wbm.artifacts.manifest import Artifact, Manifest
     from wbm.artifacts.store import Store
     from wbm.report.viewer import Shown
+    from wbm.robot.model import RobotModel
 
 ROBOT = "robot"
 _EPISODE_FOLDERS = ("shards", "episodes")
-_VIEWABLE = ("evaluation", "rollouts", "assets")  # what `wbm view reference` looks for, in this order
+_POLICIES = ("student", "teacher", "bundle")
+_VIEWABLE = ("evaluation", "student", "rollouts", "assets")  # what `wbm view reference` looks for, in this order
 _MAX_SHOWN = 200
 
 
@@ -28,17 +30,31 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         ArtifactError: no such artifact.
         ValueError: it holds nothing that can be looked at.
     """
+    from stages.commands import composer
     from stages.commands_artifacts import split
-    from wbm.report.viewer import Viewer
+    from wbm.report.viewer import Shown, Viewer
+    from wbm.robot.model import load_robot
+    from wbm.scenes.assets import robot_of
 
     store, names = split(items, count=1)
+    policy = None
     if names[0] == ROBOT:
-        shown = robot_items()
+        robot = load_robot(composer([item for item in items if "=" in item]).robot.facts)
+        shown = robot_items(robot)
     else:
         artifact = store.resolve(names[0], _VIEWABLE)
         world = _assets_of(artifact.manifest, store)
-        shown = items_of(artifact.path, artifact.manifest.kind, world.path if world else None)
-    viewer = Viewer(shown, port)
+        made_for = artifact if artifact.manifest.kind == "assets" else world
+        robot = robot_of(made_for.path) if made_for else load_robot()
+        if artifact.manifest.kind in _POLICIES:
+            from stages.view_live import WatchedPolicy, start_policy
+
+            sys.stderr.write(f"{names[0]}: building its environment and sensors\n")
+            policy = start_policy(artifact, store, composer([item for item in items if "=" in item]))
+            shown = [Shown(artifact.manifest.ref, live=WatchedPolicy(policy))]
+        else:
+            shown = items_of(artifact.path, artifact.manifest.kind, world.path if world else None)
+    viewer = Viewer(shown, port, robot)
     sys.stderr.write(f"{viewer.address} shows {names[0]} ({len(shown)} to choose from); Ctrl+C ends\n")
     try:
         while True:
@@ -47,6 +63,8 @@ def view(items: Sequence[str], port: int = 8080) -> None:
         return
     finally:
         viewer.close()
+        if policy:
+            policy.close()
 
 
 def _assets_of(manifest: Manifest, store: Store) -> Artifact | None:
@@ -59,12 +77,12 @@ def _assets_of(manifest: Manifest, store: Store) -> Artifact | None:
     return None
 
 
-def robot_items() -> list[Shown]:
+def robot_items(robot: RobotModel | None = None) -> list[Shown]:
     """The robot alone."""
     from wbm.report.tracks import robot_tracks
     from wbm.report.viewer import Shown
 
-    return [Shown(ROBOT, robot_tracks)]
+    return [Shown(ROBOT, lambda: robot_tracks(robot))]
 
 
 def items_of(path: Path, kind: str, assets: Path | None = None) -> list[Shown]:
@@ -91,6 +109,7 @@ def items_of(path: Path, kind: str, assets: Path | None = None) -> list[Shown]:
 
 
 def _scene_items(path: Path) -> list[Shown]:
+    from wbm.report.gallery import gallery_tracks
     from wbm.report.tracks import scene_tracks
     from wbm.report.viewer import Shown
     from wbm.scenes.assets import load_assets
@@ -101,7 +120,8 @@ def _scene_items(path: Path) -> list[Shown]:
         target = assets.objects.name[assets.scenes.object[k, 0]]
         return Shown(f"scene {k}: {target}", lambda: scene_tracks(assets, k))
 
-    return [shown(k) for k in range(min(len(assets.scenes), _MAX_SHOWN))]
+    gallery = Shown(f"objects ({len(assets.objects)})", lambda: gallery_tracks(assets))
+    return [*(shown(k) for k in range(min(len(assets.scenes), _MAX_SHOWN))), gallery]
 
 
 def _episode_items(folder: Path, assets_path: Path | None) -> list[Shown]:
@@ -117,7 +137,7 @@ def _episode_items(folder: Path, assets_path: Path | None) -> list[Shown]:
 
     def solids(episode: dict[str, Any]) -> tuple[Solid, ...]:
         target = np.asarray(episode["p_obj_w"], dtype=np.float64)
-        scene = str(episode["scene"])
+        scene = str(episode["scene"]).rpartition("/")[2]  # rollouts write the kind of support before the row
         if assets is None or not scene.isdigit() or int(scene) >= len(assets.scenes):
             return (target_marker(target),)
         return scene_solids(assets, int(scene), target)

@@ -21,6 +21,7 @@ from slurm_cluster import NODES, SlurmCluster, unavailable
 from slurm_support import SMALL, Lab
 
 LIMIT_S = 3600.0
+ONE = (*SMALL, "teachers=[top_down]", "scenes.kinds=[table]", "teacher.supports=[table]")
 
 
 @dataclass
@@ -112,16 +113,15 @@ def run(folder: Path, blows: Sequence[str], iterations: int, shards: int, seed: 
         shards: of the rollouts.
         seed: of the order of the blows.
     """
-    calm = Lab(folder / "calm")
-    suite = ("teacher=top_down,side", "-m", "teacher.iterations=1")
+    calm = Lab(folder / "calm", settings=ONE)
     trained = ("teacher=top_down", f"teacher.iterations={iterations}", f"teacher.eval_every={iterations}")
     made = ("teacher.iterations=1", f"rollouts.shards={shards}")
     calm.wbm("prepare-assets")
-    calm.wbm("train-teacher", *suite)
+    calm.wbm("train-teacher", "teacher.iterations=1")
     shutil.copytree(calm.folder / "artifacts", folder / "storm" / "artifacts", symlinks=True)
     expected = [calm.run("generate-rollouts", *made), calm.run("train-teacher", *trained)]
-    with SlurmCluster(folder / "slurm") as cluster:
-        lab = Lab(folder / "storm", cluster)
+    with SlurmCluster() as cluster:
+        lab = Lab(folder / "storm", cluster, ONE)
         storm = Storm(cluster, lab, blows, seed)
         submissions = [lab.submit("generate-rollouts", *made), lab.submit("train-teacher", *trained)]
         storm.pass_by("top_down")
@@ -160,7 +160,7 @@ def main() -> None:
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         figures = run(Path(folder), blows, options.iterations, options.shards)
-    print(f"{time.monotonic() - began:.0f} s, settings {' '.join(SMALL)}")
+    print(f"{time.monotonic() - began:.0f} s, settings {' '.join(ONE)}")
     for name, value in vars(figures).items():
         print(f"{name}: {value}")
     sys.exit(bool(figures.problems))

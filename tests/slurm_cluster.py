@@ -1,6 +1,6 @@
 """A real Slurm of three nodes on this machine, for tests: munge, one controller, three node daemons, on 127.0.0.1 only.
 
-`python tests/slurm_cluster.py FOLDER` starts one, says how to use it, and runs until it is interrupted. As root, with
+`python tests/slurm_cluster.py` starts one, says how to use it, and runs until it is interrupted. As root, with
 `slurm-wlm` and `munge` installed; no systemd, no cgroups.
 """
 
@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -72,15 +73,13 @@ def unavailable() -> str:
 class SlurmCluster:
     """Starts with the `with` block and ends with it.
 
-    Args:
-        folder: receives configuration, state and logs.
-
     Attributes:
+        folder: holds configuration, state and logs; every user must be able to enter it, or munge will not start.
         env: environment in which the commands of Slurm, and `wbm`, use this cluster.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self) -> None:
+        self.folder = folder = Path(tempfile.mkdtemp(prefix="wbm-slurm-", dir="/tmp"))
         self.env = {**os.environ, "SLURM_CONF": str(folder / "slurm.conf")}
         for name in [name for name in self.env if name.startswith("SLURM_") and name != "SLURM_CONF"]:
             del self.env[name]
@@ -115,7 +114,8 @@ class SlurmCluster:
         for node in NODES:
             self.kill_node(node)
         self.kill_controller()
-        _kill(_pid(self.folder / "munge" / "munged.pid"), signal.SIGTERM)
+        _kill(_pid(self.folder / "munge" / "munged.pid"), signal.SIGKILL)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def run(self, *command: str, check: bool = True) -> str:
         """Output of a command against this cluster."""
@@ -239,7 +239,7 @@ def main() -> None:
     reason = unavailable()
     if reason:
         sys.exit(reason)
-    with SlurmCluster(Path(sys.argv[1]).absolute()) as cluster:
+    with SlurmCluster() as cluster:
         print(f"export SLURM_CONF={cluster.env['SLURM_CONF']}\n{cluster.run('sinfo')}", flush=True)
         signal.signal(signal.SIGTERM, lambda *_: sys.exit())
         signal.pause()

@@ -294,3 +294,8 @@ def test_planning_imports_nothing_heavy(root):
     code += "print([m for m in ('torch','warp','mujoco') if m in sys.modules], file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code, "plan", root], env=ENV, capture_output=True, text=True)
     assert done.stderr.strip().splitlines()[-1] == "[]"
+
+
+def test_kernels_load_without_a_word():
+    done = subprocess.run([sys.executable, "-c", "import wbm.kernels.se3"], env=ENV, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

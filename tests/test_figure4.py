@@ -30,6 +30,7 @@ from wbm.learning.figure4_config import ARMS, Figure4Config
 from wbm.report.figure4 import Run, gather, write_figure4
 from wbm.report.stats import wilson
 from wbm.robot.config import MjcfOptions
+from wbm.robot.model import load_robot
 from wbm.sim.config import SimConfig
 
 TINY = Figure4Config(
@@ -57,7 +58,8 @@ class Killed(Exception):
 def tiny_run(arm: str, folder: Path, stop_after: int = 99):
     _, bank = scenes()
     split = np.where(np.arange(len(bank)) % 2 == 0, "train", "test")
-    assets = SimpleNamespace(objects=scenes()[0].objects, scenes=replace(bank, split=split))
+    split_bank = replace(bank, split=split)
+    assets = SimpleNamespace(objects=scenes()[0].objects, scenes=split_bank, robot=load_robot())
     env = EnvConfig(action=CASES[arm], episode_s=1.2, approach_s=0.6, starts_per_scene=1)
     world = run_world(WorldConfig(MjcfOptions(), SimConfig(), WbcConfig(), env), TINY)
 

@@ -28,8 +28,8 @@ def test_every_object_can_be_grasped(entries):
     for entry in entries:
         low, high = parts.bounds(entry.parts)
         extent = np.sort(high - low)
-        assert 0.02 <= extent[0] <= 0.12 and extent[2] <= 0.22, entry.name
-        assert min(high[0] - low[0], high[1] - low[1]) <= 0.12, entry.name
+        assert 0.03 - 1e-9 <= extent[0] <= 0.12 and extent[2] <= 0.22, entry.name
+        assert 0.03 <= min(high[0] - low[0], high[1] - low[1]) <= 0.12, entry.name
         assert low[2] == pytest.approx(0.0, abs=1e-9), entry.name
         assert 0.05 <= entry.mass <= 0.4
         assert 1 <= len(entry.parts) <= parts.MAX_PARTS

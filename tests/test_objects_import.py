@@ -11,6 +11,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from stages.cli import main
 from wbm.scenes import cache, decompose, isolate, meshfile, parts, sources
 from wbm.scenes.config import ObjectsConfig
 from wbm.scenes.meshfile import MeshError
@@ -110,6 +111,8 @@ HOSTILE = {
         ),
         "declares",
     ),
+    "parts.glb": (glb({"accessors": [{"count": 100_000, "type": "VEC3"}] * 50}), "declares"),
+    "outside.glb": (glb({"buffers": [{"uri": "../secret.bin", "byteLength": 4}]}), "another file"),
     "deep.glb": (glb({"accessors": [{"count": -5}]}), "negative"),
     "cut.stl": (FILES["stl"][:5000], "truncated"),
 }
@@ -210,7 +213,7 @@ def test_a_folder_is_imported_and_broken_files_are_named(tmp_path):
         "kind1/RedToy_1.stl",
         "kind1/RedToy_3.glb",
     ]
-    assert set(objects.noun) == {"red toy"}
+    assert set(objects.noun) == {"toy"}
     np.testing.assert_allclose(objects.half_extent[:, 2], 0.04, rtol=0.15)
     seen = []
     again, _ = sources.collect_objects(cfg, 3, lambda jobs: (seen.append(i) or i for i in jobs))
@@ -278,3 +281,33 @@ def test_families_are_held_out_where_folders_name_them():
     assert len(set(chosen)) == 2 and set(chosen) <= set(families)
     assert sources.choose_held_out([f"own{i}" for i in range(60)], cfg, 0) == ()
     assert sources.choose_held_out(families, ObjectsConfig(held_out=("kind3",)), 0) == ("kind3",)
+
+
+@pytest.mark.parametrize(
+    ("stem", "noun"),
+    [
+        ("RedToyCar_03", "toy car"),
+        ("tall_can", "can"),
+        ("000", "object"),
+        ("model_mesh", "object"),
+        ("mug-blue", "mug"),
+    ],
+)
+def test_nouns_come_from_file_names_without_colours_and_sizes(stem, noun):
+    assert sources.noun_of(stem) == noun
+
+
+def test_the_stage_fails_where_most_meshes_do_and_notices_a_changed_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def wbm(*arguments):
+        with pytest.raises(SystemExit) as stop:
+            main([*arguments, "objects=meshes", f"objects.path={folder_with(tmp_path, bad=6)}"])
+        return stop.value.code, *capsys.readouterr()
+
+    code, _, err = wbm("prepare-assets")
+    assert code == 1 and "6 of 10 meshes" in err and "broken_0.obj" in err and "Traceback" not in err
+    before = json.loads(wbm("plan", "--until", "prepare-assets", "--json")[1])["stages"][0]["key"]
+    assert json.loads(wbm("plan", "--until", "prepare-assets", "--json")[1])["stages"][0]["key"] == before
+    SOLID.copy().apply_scale(1.01).export(tmp_path / "meshes" / "kind0" / "more.obj")
+    assert json.loads(wbm("plan", "--until", "prepare-assets", "--json")[1])["stages"][0]["key"] != before

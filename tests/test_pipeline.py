@@ -7,25 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import SMALL
 
 pytestmark = [pytest.mark.pipeline, pytest.mark.slow]
-
-SMALL = [
-    "profile=smoke",
-    "objects.count=16",
-    "scenes.count=4",
-    "scenes.test_count=2",
-    "teachers=[top_down]",
-    "teacher.iterations=2",
-    "teacher.eval_every=2",
-    "teacher.num_envs=16",
-    "rollouts.episodes=4",
-    "rollouts.num_envs=4",
-    "distill.iterations=20",
-    "evaluation.episodes=2",
-    "evaluation.videos=1",
-    "evaluation.filmstrips=0",
-]
 
 
 def wbm(*arguments: str, root: Path) -> subprocess.CompletedProcess:
@@ -39,12 +23,9 @@ def wbm(*arguments: str, root: Path) -> subprocess.CompletedProcess:
     )
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("store")
-    done = wbm("run", *SMALL, root=folder)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return folder
+@pytest.fixture
+def root(small_store) -> Path:
+    return small_store
 
 
 def test_every_kind_is_published_and_intact(root):

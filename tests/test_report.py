@@ -75,7 +75,8 @@ def test_bad_configuration_is_refused(change):
 
 
 def test_percent():
-    assert [percent(v) for v in (None, 0, 0.004, 0.65, 0.995, 1)] == ["–", "0 %", "0.4 %", "65 %", "99.5 %", "100 %"]
+    shown = [percent(v).replace("\u00a0", " ") for v in (None, 0, 0.004, 0.65, 0.995, 1)]
+    assert shown == ["–", "0 %", "0.4 %", "65 %", "99.5 %", "100 %"]
 
 
 def test_svg_is_valid_deterministic_and_follows_the_theme(tmp_path):

@@ -11,9 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wbm.artifacts.mcap_io import BOX, EpisodeTracks, Solid
+from wbm.report.sight import sight_image
 from wbm.report.tracks import frame_tracks, joint_tracks, mats_to_quats, robot_tracks
 from wbm.robot.model import frame_poses, load_robot
 from wbm.robot.proprio import FRAMES, proprioception, quat_to_mat
+from wbm.robot.schema import ActionSpec, to_target
 from wbm.robot.spheres import batched_kinematics
 
 
@@ -59,6 +61,7 @@ def make_tracks(steps: int = 60) -> EpisodeTracks:
     return EpisodeTracks(
         times=times,
         q=q,
+        action=rng.uniform(-1, 1, q.shape),
         camera=(cloud, rng.integers(0, 256, (steps, 40, 3), dtype=np.uint8), np.ones((steps, 40), np.uint8)),
         lidar=(cloud * 2, np.ones((steps, 40), np.uint8)),
         solids=(
@@ -75,7 +78,7 @@ def viewer():
     mask = np.zeros((60, 40), np.uint8)
     mask[:, :10] = 1
     items = [
-        module.Shown("episode 0", make_tracks, mask, np.zeros((60, 3))),
+        module.Shown("episode 0", make_tracks, mask),
         module.Shown("robot", lambda: robot_tracks(seconds=2.0)),
     ]
     viewer = module.Viewer(items, port=0)
@@ -94,6 +97,9 @@ def test_steps_place_robot_and_objects(viewer):
     colours = np.asarray(viewer._parts["camera"].colors)
     assert (colours[:10] == (255, 70, 20)).all() and not (colours[10:] == (255, 70, 20)).all(axis=1).any()
     assert "contact" in viewer._clock.content
+    rot_w, pos_w = frame_poses(robot, to_target(tracks.q[40], tracks.action[40], ActionSpec()))["ee"]
+    np.testing.assert_allclose(viewer._parts["command"].position, pos_w, atol=1e-9)
+    np.testing.assert_allclose(quat_to_mat(np, np.array(viewer._parts["command"].wxyz)), rot_w, atol=1e-9)
     viewer.show(10_000)
     assert viewer.step == 59
     viewer._select("robot")
@@ -107,6 +113,95 @@ def test_playing_follows_the_clock_and_stops_at_the_end(viewer):
     while viewer.playing and time.monotonic() < deadline:
         time.sleep(0.05)
     assert viewer.step == 59 and not viewer.playing and viewer._play.label == "Play"
+
+
+def test_the_picture_shows_points_where_the_camera_sees_them():
+    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.5, 0.0, 1.0], [0.0, 0.25, 1.0], [0.0, 0.0, -1.0]])
+    colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [255, 255, 255]], np.uint8)
+    image = sight_image(points, colours, np.eye(3), np.zeros(3), 200, 100)
+    assert tuple(image[50, 100]) == (255, 0, 0)  # the nearer of two on the axis
+    assert tuple(image[50, int(100 * (1 + 0.5 / np.tan(np.radians(43.5))))]) == (0, 0, 255)
+    assert tuple(image[int(50 * (1 + 0.25 / np.tan(np.radians(29.0)))), 100]) == (255, 255, 0)
+    assert not (image == 255).all(axis=2).any()  # behind the camera
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    moved = sight_image(points @ turn.T + [1, 2, 3], colours, turn, np.array([1.0, 2, 3]), 200, 100)
+    np.testing.assert_array_equal(moved, image)
+
+
+class ScriptedPolicy:
+    """Two episodes of a policy that takes a step whenever it is asked and not paused."""
+
+    def __init__(self, lengths: tuple[int, ...] = (12, 60)) -> None:
+        self.lengths, self.number, self.steps, self.paused, self.speed = lengths, 0, 0, True, 0.0
+        self.error = ""
+
+    def set_pace(self, paused: bool, speed: float) -> None:
+        self.paused, self.speed = paused, speed
+
+    def poll(self):
+        if self.error:
+            raise ValueError(self.error)
+        if not self.paused:
+            if self.steps == self.lengths[self.number] and self.number + 1 < len(self.lengths):
+                self.number, self.steps = self.number + 1, 0
+            self.steps = min(self.steps + 1, self.lengths[self.number])
+        mask = np.zeros((max(self.steps, 1), 40), np.uint8)
+        return self.number, make_tracks(self.steps), mask
+
+
+@pytest.fixture
+def live():
+    module = pytest.importorskip("wbm.report.viewer", reason="needs viser")
+    policy = ScriptedPolicy()
+    viewer = module.Viewer([module.Shown("student", live=policy), module.Shown("robot", robot_tracks)], port=0)
+    yield viewer, policy
+    viewer.close()
+
+
+def wait_for(condition) -> None:
+    deadline = time.monotonic() + 60
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert condition()
+
+
+def test_a_live_policy_is_followed_paused_and_looked_back_on(live):
+    viewer, policy = live
+    wait_for(lambda: policy.number == 1 and viewer._number == 1 and viewer.step > 20)
+    viewer._speed.value = "2"
+    wait_for(lambda: policy.speed == 2.0)
+    viewer._scrub.value = 5  # looking back holds the policy
+    viewer._scrubbed()
+    assert policy.paused and not viewer.playing and viewer.step == 5
+    _, pos = batched_kinematics(viewer.robot, viewer.tracks.q)
+    np.testing.assert_allclose(viewer._link_pos, pos, atol=1e-12)  # built up step by step
+    steps = policy.steps
+    time.sleep(0.2)
+    assert policy.steps == steps and viewer.step == 5
+    viewer._toggle()
+    wait_for(lambda: viewer.step == 59)
+    policy.error = "the hand fell off"
+    wait_for(lambda: "the hand fell off" in viewer._clock.content)
+    assert not viewer.playing
+    viewer._select("robot")
+    assert policy.paused and not viewer.playing
+
+
+@pytest.mark.browser
+def test_a_live_policy_in_a_browser(live):
+    viewer, policy = live
+    with (
+        chromium(("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")) as browser,
+        page_of(browser, 900, 600) as (page, troubles),
+    ):
+        page.goto(viewer.address)
+        page.wait_for_selector("canvas", timeout=60_000)
+        page.get_by_text("2.36 s").wait_for(timeout=60_000)
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_role("button", name="Play").wait_for(timeout=20_000)
+        assert policy.paused
+        assert page.get_by_text("What the student sees").count() == 1
+        assert not troubles
 
 
 @pytest.mark.browser

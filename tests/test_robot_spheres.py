@@ -1,5 +1,7 @@
 """Collision spheres cover the geometry; the pair list holds what can touch and nothing rigid."""
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,6 +9,8 @@ import pytest
 from wbm.robot import joints, mjcf, model, spheres
 from wbm.robot.facts import quat_to_mat
 from wbm.robot.geometry import BOX, CAPSULE, CYLINDER
+
+LONG_ARM = Path(__file__).parents[1] / "docs" / "examples" / "long_arm.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +50,10 @@ def surface_points(geom, count, rng):
     return points @ quat_to_mat(np.array(geom.quat)).T + np.array(geom.pos)
 
 
-def test_every_surface_point_is_within_5_mm_of_a_sphere(robot, cover):
+@pytest.mark.parametrize("facts", ["", LONG_ARM], ids=["standard", "own"])
+def test_every_surface_point_is_within_5_mm_of_a_sphere(facts):
+    robot = model.load_robot(facts)
+    cover = spheres.robot_spheres(robot)
     rng = np.random.default_rng(1)
     worst = 0.0
     for geom in robot.geoms:

@@ -1,7 +1,11 @@
 """Instructions name one object of their scene; their encoder is the published one."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scenes_small import small_bank, small_objects
 
 from wbm.scenes import encoder, instructions
@@ -14,13 +18,20 @@ def referents(phrase, objects, bank, k):
     slots = [i for i, o in enumerate(bank.object[k]) if o >= 0]
     inverse = bank.support_quat[k, 0] * [1, -1, -1, -1]
     local = rotate(inverse, bank.object_pos[k])
-    words = phrase.split()
-    noun_of = lambda i: str(objects.noun[bank.object[k, i]])
-    if " to the " in phrase:
-        noun, side, other = words[0], words[3], words[-1]
-        (anchor,) = [i for i in slots if noun_of(i) == other]
-        sign = 1 if side == "left" else -1
-        return [i for i in slots if noun_of(i) == noun and i != anchor and sign * (local[i, 1] - local[anchor, 1]) > 0]
+
+    def called(phrase):
+        kept = []
+        for i in slots:
+            o = bank.object[k, i]
+            have = {*str(objects.noun[o]).split(), str(objects.color[o]), str(objects.size_word[o]), "object"}
+            kept += [i] if set(phrase.split()) <= have else []
+        return kept
+
+    for side, sign in (("left", 1), ("right", -1)):
+        noun, found, other = phrase.partition(f" to the {side} of the ")
+        if found:
+            (anchor,) = called(other)
+            return [i for i in called(noun) if i != anchor and sign * (local[i, 1] - local[anchor, 1]) > 0]
     if phrase == "object in front of you":
         return slots
     if phrase == "leftmost object":
@@ -29,12 +40,7 @@ def referents(phrase, objects, bank, k):
         return [min(slots, key=lambda i: local[i, 1])]
     if phrase == "object nearest to you":
         return [min(slots, key=lambda i: local[i, 0])]
-    fits = []
-    for i in slots:
-        o = bank.object[k, i]
-        have = {str(objects.noun[o]), str(objects.color[o]), str(objects.size_word[o]), "object"}
-        fits += [i] if set(words) <= have else []
-    return fits
+    return called(phrase)
 
 
 def test_every_description_names_the_target_alone():
@@ -47,6 +53,46 @@ def test_every_description_names_the_target_alone():
             assert referents(phrase, objects, bank, k) == [0], (phrase, k)
             seen.add("relation" if " to the " in phrase else phrase.split()[-1])
     assert "relation" in seen and len(seen) > 5
+
+
+NOUNS = ("can", "car", "toy car", "toy", "object")  # colours and sizes are never part of one
+
+
+@st.composite
+def crowded(draw):
+    """Up to four things with overlapping names, anywhere on a turned support."""
+    count = draw(st.integers(1, 4))
+    pick = lambda values: np.array([draw(st.sampled_from(values)) for _ in range(4)])
+    objects = SimpleNamespace(noun=pick(NOUNS), color=pick(("red", "blue")), size_word=pick(("", "tall", "small")))
+    place = np.array([[draw(st.sampled_from((0.0, 0.1, 0.2, 0.4))) for _ in range(2)] for _ in range(4)])
+    yaw = draw(st.floats(-0.3, 0.3))
+    bank = SimpleNamespace(
+        object=np.array([[k if k < count else -1 for k in range(4)]]),
+        object_pos=np.c_[place, np.full(4, 0.5)][None],
+        support_quat=np.array([[[np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]]]),
+    )
+    return objects, bank
+
+
+@settings(max_examples=300, deadline=None)
+@given(crowded())
+def test_no_description_fits_anything_else_whatever_is_there(scene):
+    objects, bank = scene
+    for phrase in descriptions(objects, bank, 0):
+        assert referents(phrase, objects, bank, 0) == [0], phrase
+
+
+def test_a_noun_within_another_is_not_used_alone():
+    objects = SimpleNamespace(
+        noun=np.array(["car", "toy car"]), color=np.array(["red", "blue"]), size_word=np.array(["", ""])
+    )
+    bank = SimpleNamespace(
+        object=np.array([[0, 1]]),
+        object_pos=np.array([[[0.5, 0.0, 0.5], [0.5, 0.3, 0.5]]]),
+        support_quat=np.array([[[1.0, 0.0, 0.0, 0.0]]]),
+    )
+    phrases = descriptions(objects, bank, 0)
+    assert "red car" in phrases and "car" not in phrases and "rightmost object" in phrases
 
 
 def test_phrasings_are_disjoint_and_rows_point_to_sentences():

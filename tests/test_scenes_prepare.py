@@ -97,7 +97,7 @@ def test_contact_sheets_show_things(made):
     objects = load_assets(made[0].path).objects
     sheet = np.asarray(Image.open(made[0].path / "objects.png")).astype(float)
     for o in range(0, 12):  # the middle of a tile has its object's hue
-        tile = sheet[40:72, o * 112 + 40 : o * 112 + 72].reshape(-1, 3) / 255
+        tile = sheet[40:72, o * 128 + 48 : o * 128 + 80].reshape(-1, 3) / 255
         shade = tile / np.maximum(tile.max(axis=1, keepdims=True), 1e-6)
         hue = objects.rgb[o] / objects.rgb[o].max()
         assert np.abs(shade - hue).max(axis=1).min() < 0.12, objects.name[o]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from wbm.robot.facts import quat_to_mat
 from wbm.robot.model import load_robot
 from wbm.sensors.bench_scene import robot_bodies, sample_meshes, tabletop
-from wbm.sensors.bundles import build_table
+from wbm.sensors.bundles import GROUP, SUBGROUP, build_table, common_part
 from wbm.sensors.config import DepthConfig, LidarConfig
 from wbm.sensors.depth import DepthCamera, pinhole_rays
 from wbm.sensors.lidar import Lidar, scan_rays
@@ -163,17 +163,49 @@ def test_any_bundle_size_gives_the_same_hits(world):
         np.testing.assert_array_equal(instances, found[0][1])
 
 
+def test_three_kernels_and_one_agree_to_the_bit(world):
+    """A GPU takes the three steps apart, a CPU takes an environment through all of them in shared memory."""
+    _, scene, _, rng = world
+    rays = scan_rays(LidarConfig(num_rays=500))
+    pos, quat = rng.uniform([-1, -1, 0.3], [0.3, 1, 1.5], (4, 3)), [random_quat(rng) for _ in range(4)]
+    found = []
+    for keep in (False, True):
+        sensor = RaySensor(scene, rays, 0.0, 8.0, keep_slots=keep)
+        sensor.pos.assign(pos.astype(np.float32))
+        sensor.quat.assign(np.array(quat, np.float32))
+        sensor.step.assign(np.array([0, 5, 9, 2]))
+        poison(sensor)
+        sensor.trace(sensor.env_index(None))
+        if keep:
+            at_once = sensor.true_range.numpy().copy(), sensor.true_instance.numpy().copy()
+            poison(sensor)
+            sensor._cast_in_steps(sensor.env_index(None))
+            found.append(at_once)
+        found.append((sensor.true_range.numpy(), sensor.true_instance.numpy()))
+    assert (found[0][1] >= 0).sum() > 500
+    for ranges, instances in found[1:]:
+        np.testing.assert_array_equal(ranges, found[0][0])
+        np.testing.assert_array_equal(instances, found[0][1])
+
+
 @settings(max_examples=30, deadline=None)
 @given(num=st.integers(1, 300), bundle=st.integers(1, 70), seed=st.integers(0, 1000))
 def test_bundles_hold_every_ray_once_inside_its_cone(num, bundle, seed):
     rays = np.random.default_rng(seed).normal(size=(2, num, 3))
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    table = build_table(rays, bundle)
+    part = common_part(bundle)
+    table = build_table(rays, bundle, part)
     for pattern in range(2):
         np.testing.assert_array_equal(np.sort(table.order[pattern]), np.arange(num))
         for k, ray in enumerate(table.order[pattern]):
-            cone = table.cone[pattern, k // bundle]
-            assert rays[pattern, ray] @ cone[:3] >= cone[3]
+            for cones, size in (
+                (table.cone, bundle),
+                (table.part_cone, part),
+                (table.subgroup_cone, bundle * SUBGROUP),
+                (table.group_cone, bundle * GROUP),
+            ):
+                cone = cones[pattern, k // size]
+                assert rays[pattern, ray] @ cone[:3] >= cone[3]
 
 
 def test_lidar_scan_follows_the_two_axes():

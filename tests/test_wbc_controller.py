@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from wbm.control.config import WbcConfig
+from wbm.control.program import program
 from wbm.control.wbc import WholeBodyController
 from wbm.robot.joints import WBC
 from wbm.robot.mjcf import robot_spec
@@ -42,23 +43,6 @@ def place(c: WholeBodyController, seed: int, spread: float = 0.4) -> None:
     c.obstacle_pos.numpy()[:, 1] = target + np.array([0.0, 0.25, 0.05])
     c.obstacle_quat.numpy()[:] = [1, 0, 0, 0]
     c.reset(None)
-
-
-def exact_velocity(program) -> np.ndarray:
-    """The program by an active-set solver in float64, with its slacks as variables."""
-    import qpsolvers
-
-    rows, n = program.A.shape
-    P = np.zeros((n + rows, n + rows))
-    P[:n, :n], P[n:, n:] = program.H, program.rho * np.eye(rows)
-    q = np.concatenate([-program.g, np.zeros(rows)])
-    G = -np.hstack([program.A, np.eye(rows)]) if rows else None
-    h = -program.b if rows else None
-    lower = np.concatenate([program.low.astype(float), np.zeros(rows)])
-    upper = np.concatenate([program.high.astype(float), np.full(rows, np.inf)])
-    solution = qpsolvers.solve_qp(P, q, G, h, lb=lower, ub=upper, solver="daqp")
-    assert solution is not None
-    return solution[:n]
 
 
 def test_frames_agree_with_mujoco(controller):
@@ -103,7 +87,7 @@ def test_the_program_is_solved_as_a_float64_solver_solves_it(controller):
         controller.step()
         if step % 6 == 5:
             for e in (0, N // 2):
-                exact = exact_velocity(controller.program(e))
+                exact = program(controller, e).solve()
                 worst = max(worst, np.abs(exact - controller.qd.numpy()[e]).max())
         controller.q.numpy()[:, WBC] = controller.q_target.numpy()
     assert worst < 1e-3

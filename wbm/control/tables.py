@@ -41,30 +41,33 @@ class Tables:
         return tree
 
 
-def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray) -> Tables:
+def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray, joints: np.ndarray = WBC) -> Tables:
     """Fold fixed links into their bodies, turn joint axes onto z, and group the spheres.
 
     Args:
         robot: the kinematic tree.
         spheres: collision spheres on its links.
-        pairs: self-collision pairs of spheres [P,2].
+        pairs: self-collision pairs of spheres [P,2]; those that no controlled joint moves apart are left out.
+        joints: indices of the controlled joints [J].
     """
     body, body_rot, body_pos, parents, offsets = _bodies(robot)
     count = len(parents)
     joint_of = np.array([robot.joint_index[i] for i in range(len(body)) if robot.joint_type[i] != FIXED])
     slide = np.array([robot.joint_type[i] == SLIDE for i in range(len(body)) if robot.joint_type[i] != FIXED])
-    slot = {int(j): k for k, j in enumerate(WBC)}
+    slot = {int(j): k for k, j in enumerate(joints)}
     mask = np.zeros(count, dtype=np.int64)
     for b in range(count):
         above = mask[parents[b]] if parents[b] >= 0 else 0
         mask[b] = above | (1 << slot[int(joint_of[b])] if int(joint_of[b]) in slot else 0)
 
-    group = np.array([_group(robot, link) for link in spheres.link])
+    group = np.array([_group(robot, link, set(joints.tolist())) for link in spheres.link])
     order = np.argsort(group, kind="stable").astype(np.int32)
     names, starts = np.unique(group[order], return_index=True)
     group_mask = np.array([_mask_of(mask, body[name]) for name in names], dtype=np.int64)  # pyright: ignore[reportArgumentType]
-    block, pair = _blocks(np.asarray(pairs), group, names, order)
-    group_parent, group_own, group_joint = _group_chain(group_mask)
+    pairs = np.asarray(pairs).reshape(-1, 2)
+    moved_by = np.array([_mask_of(mask, int(body[link])) for link in group])
+    block, pair = _blocks(pairs[moved_by[pairs[:, 0]] != moved_by[pairs[:, 1]]], group, names, order)
+    group_parent, group_own, group_joint = _group_chain(group_mask, len(joints))
     sphere_body = np.array([body[link] for link in spheres.link[order]], dtype=np.int32)
     if (sphere_body < 0).any():
         raise ValueError("spheres: every sphere must sit on a link that a joint moves")
@@ -78,7 +81,7 @@ def build_tables(robot: RobotModel, spheres: SphereSet, pairs: np.ndarray) -> Ta
         "body_rot": np.array([r for r, _ in offsets]),
         "body_slide": slide.astype(np.int32),
         "body_joint": joint_of.astype(np.int32),
-        "joint_body": np.array([int(np.flatnonzero(joint_of == j)[0]) for j in WBC], dtype=np.int32),
+        "joint_body": np.array([int(np.flatnonzero(joint_of == j)[0]) for j in joints], dtype=np.int32),
         "frame_body": np.array([body[f.link] for f in frames.values()], dtype=np.int32),
         "frame_pos": np.array([body_pos[f.link] + body_rot[f.link] @ f.pos for f in frames.values()]),
         "frame_rot": np.array([body_rot[f.link] @ quat_to_mat(f.quat) for f in frames.values()]),
@@ -144,12 +147,11 @@ def _z_onto(axis: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _group(robot: RobotModel, link: int) -> int:
+def _group(robot: RobotModel, link: int, controlled: set[int]) -> int:
     """The link that stands for a sphere's group: links below joints that the controller does not move share one."""
     chain = [link]
     while robot.parent[chain[-1]] > 0:
         chain.append(int(robot.parent[chain[-1]]))
-    controlled = set(WBC.tolist())
     top = link
     for above in chain:
         if robot.joint_type[above] != FIXED and int(robot.joint_index[above]) not in controlled:
@@ -161,14 +163,14 @@ def _mask_of(mask: np.ndarray, body: int) -> int:
     return int(mask[body]) if body >= 0 else 0
 
 
-def _group_chain(group_mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _group_chain(group_mask: np.ndarray, joints: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each group the earlier group that shares most of its joints, and the joints beside those."""
     parent, own, joint = [], [0], []
     for g, bits in enumerate(group_mask.tolist()):
         inside = [h for h in range(g) if group_mask[h] & ~bits == 0]
         best = max(inside, key=lambda h: int(group_mask[h]).bit_count(), default=-1)
         rest = bits & ~(int(group_mask[best]) if best >= 0 else 0)
-        joint += [j for j in range(len(WBC)) if rest >> j & 1]
+        joint += [j for j in range(joints) if rest >> j & 1]
         parent.append(best)
         own.append(len(joint))
     return tuple(np.array(x, dtype=np.int32) for x in (parent, own, joint))  # type: ignore[return-value]

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import numpy as np
 import warp as wp
@@ -29,23 +29,8 @@ from wbm.robot.spheres import SphereSet, robot_spheres, self_pairs
 
 SELF_CAPACITY = 48
 CANDIDATES_PER_SPHERE = 2
+BASE_JOINTS = np.arange(BASE.start, BASE.stop)
 YAW_LEVER = 0.35  # m, about the robot's radius: turning the base costs what moving its rim costs
-
-
-@dataclass(frozen=True)
-class Program:
-    """One environment's quadratic program in float64.
-
-    `min 1/2 x^T H x - g^T x + rho/2 |s|^2` subject to `low <= x <= high`, `A x + s >= b`, `s >= 0`.
-    """
-
-    H: np.ndarray
-    g: np.ndarray
-    A: np.ndarray
-    b: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    rho: float
 
 
 class WholeBodyController:
@@ -81,6 +66,7 @@ class WholeBodyController:
         device: str = "cpu",
         spheres: SphereSet | None = None,
         pairs: np.ndarray | None = None,
+        joints: np.ndarray = WBC,
     ) -> None:
         """Allocate arrays and capture the graphs.
 
@@ -92,20 +78,24 @@ class WholeBodyController:
             device: "cpu" or a CUDA device.
             spheres: collision spheres; the robot's own if left out.
             pairs: self-collision pairs [P,2] of spheres; the robot's own if left out.
+            joints: indices of the controlled joints [J], at most 16, those of the base first; the rest stay still.
 
         Raises:
-            ValueError: a count is out of range.
+            ValueError: a count is out of range, or the joints do not begin with the base's.
         """
         if num_envs < 1:
             raise ValueError(f"controller: num_envs is {num_envs}, give at least 1")
         if num_obstacles < 0:
             raise ValueError(f"controller: num_obstacles is {num_obstacles}, give 0 or more")
+        if not len(BASE_JOINTS) <= len(joints) <= len(WBC) or (joints[: len(BASE_JOINTS)] != BASE_JOINTS).any():
+            raise ValueError(f"controller: joints are {list(joints)}, give the base's three and up to 13 more")
+        self.joints = np.asarray(joints)
         self.robot, self.num_envs, self.num_obstacles = robot, num_envs, num_obstacles
         self.cfg = cfg or WbcConfig()
         self.device = wp.get_device(device)
         self.spheres = robot_spheres(robot) if spheres is None else spheres
         self.pairs = self_pairs(robot, self.spheres) if pairs is None else np.asarray(pairs)
-        self._tables = build_tables(robot, self.spheres, self.pairs)
+        self._tables = build_tables(robot, self.spheres, self.pairs, self.joints)
         self.frame_names = self._tables.frame_names
         self._allocate_tables()
         self._allocate_inputs()
@@ -140,25 +130,6 @@ class WholeBodyController:
         else:
             wp.to_torch(self._fresh)[ids.tolist()] = 1
 
-    def program(self, env: int) -> Program:
-        """The quadratic program that the last `step` solved for one environment (for tests and benchmarks)."""
-        jac, vel, weight = (a.numpy()[env].astype(np.float64) for a in (self._jac, self._vel, self._weight))
-        counts, starts = self._count.numpy()[env], self._region_start.numpy()
-        used = np.concatenate([np.arange(s, s + c) for s, c in zip(starts[:-1], counts, strict=True)]).astype(int)
-        wrench = np.concatenate([a.numpy()[env, used].astype(np.float64) for a in (self._moment, self._force)], axis=1)
-        bits = self._tables.tree["group_mask"][:, None] >> np.arange(len(WBC)) & 1
-        side = self._side.numpy()[env, used]
-        sign = bits[side[:, 0]] - np.where(side[:, 1:] >= 0, bits[side[:, 1]], 0)
-        return Program(
-            H=jac.T @ (weight[:, None] * jac) + np.diag(self._diag.numpy()[env].astype(np.float64)),
-            g=jac.T @ (weight * vel) + self._rhs.numpy()[env].astype(np.float64),
-            A=sign * (wrench @ self._screw.numpy()[env].astype(np.float64).T),
-            b=self._bound.numpy()[env, used].astype(np.float64),
-            low=self._low.numpy()[env].copy(),
-            high=self._high.numpy()[env].copy(),
-            rho=self.cfg.slack_weight,
-        )
-
     def _array(self, shape: tuple[int, ...], dtype: type, value: float = 0.0) -> wp.array:
         out = wp.zeros(shape, dtype=dtype, device=self.device)
         if value:
@@ -179,13 +150,13 @@ class WholeBodyController:
         self._region_start = self._upload(start, wp.int32)
         self._num_candidates = int(start[-1])
         limits = wbc_assemble.Limits()
-        limits.joint = self._upload(WBC.astype(np.int32), wp.int32)
+        limits.joint = self._upload(self.joints.astype(np.int32), wp.int32)
         for name, value in (
-            ("q_min", robot.q_min[WBC]),
-            ("q_max", robot.q_max[WBC]),
-            ("speed", robot.qd_max[WBC]),
-            ("acceleration", robot.qdd_max[WBC]),
-            ("base_scale", np.r_[1.0, 1.0, YAW_LEVER, np.zeros(13)]),
+            ("q_min", robot.q_min[self.joints]),
+            ("q_max", robot.q_max[self.joints]),
+            ("speed", robot.qd_max[self.joints]),
+            ("acceleration", robot.qdd_max[self.joints]),
+            ("base_scale", np.r_[1.0, 1.0, YAW_LEVER, np.zeros(len(self.joints) - 3)]),
         ):
             setattr(limits, name, self._upload(value.astype(np.float32), wp.float32))
         limits.dt = cfg.dt
@@ -196,8 +167,8 @@ class WholeBodyController:
         frames.ee, frames.camera = (self.frame_names.index(n) for n in ("ee", "camera"))
         frames.ee_mask, frames.camera_mask = (t.frame_mask[n] for n in ("ee", "camera"))
         frames.base = self.frame_names.index("base")
-        frames.yaw = int(np.flatnonzero(BASE.start + 2 == WBC)[0])
-        frames.pan = int(np.flatnonzero(NECK.start == WBC)[0])
+        frames.yaw = 2
+        frames.pan = int(np.append(np.flatnonzero(NECK.start == self.joints), -1)[0])
         frames.pan_mount, frames.pan_zero = neck_pan(robot)
         self._frames = frames
 
@@ -208,7 +179,7 @@ class WholeBodyController:
         self.ee_quat = self._upload(np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)).astype(np.float32), wp.vec4)
         self.gaze_point = self._array((n,), wp.vec3)
         self.gaze_weight = self._array((n,), wp.float32, 1.0)
-        self.q_posture = self._upload(np.tile(self.robot.q_home[WBC], (n, 1)).astype(np.float32), wp.float32)
+        self.q_posture = self._upload(np.tile(self.robot.q_home[self.joints], (n, 1)).astype(np.float32), wp.float32)
         self.obstacle_type = self._array((n, m), wp.int32, distance.NO_OBSTACLE)
         self.obstacle_size = self._array((n, m), wp.vec3)
         self.obstacle_pos = self._array((n, m), wp.vec3)
@@ -228,7 +199,7 @@ class WholeBodyController:
         self._targets = targets
 
     def _allocate_state(self) -> None:
-        n, joints, rows = self.num_envs, len(WBC), wbc_objectives.ROWS
+        n, joints, rows = self.num_envs, len(self.joints), wbc_objectives.ROWS
         bodies, frames, spheres = len(self._tables.tree["body_parent"]), len(self.frame_names), len(self.spheres)
         groups, c = self._num_groups, self._num_candidates
         a = self._array

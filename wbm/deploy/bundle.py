@@ -7,6 +7,7 @@ import json
 import os
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -223,11 +224,7 @@ class Bundle:
 
 def _can_check() -> bool:
     """Whether signatures can be checked here; if not, and no key is asked for, `signer` stays empty."""
-    try:
-        import cryptography  # noqa: F401
-    except ImportError:
-        return False
-    return True
+    return find_spec("cryptography") is not None
 
 
 def _load_json(data: bytes, name: str, fault: Fault) -> dict[str, Any]:

@@ -225,13 +225,22 @@ def _records(path: Path) -> Iterator[Any]:
 
 
 def read_messages(path: str | Path, topic: str) -> Iterator[tuple[float, Any]]:
-    """Messages of one topic of a run's log: (stamp in s, decoded JSON or dictionary of arrays)."""
+    """Messages of one topic of a run's log: (stamp in s, decoded JSON or dictionary of arrays).
+
+    Raises:
+        ValueError: no MCAP file, or one that a killed process left unfinished.
+    """
+    from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
     with open(path, "rb") as stream:
-        for _, channel, message in make_reader(stream).iter_messages(topics=[topic]):
-            data = decode_arrays(message.data) if channel.message_encoding == "wbm-arrays" else json.loads(message.data)
-            yield message.log_time / 1e9, data
+        try:
+            for _, channel, message in make_reader(stream).iter_messages(topics=[topic]):
+                arrays = channel.message_encoding == "wbm-arrays"
+                yield message.log_time / 1e9, decode_arrays(message.data) if arrays else json.loads(message.data)
+        except (McapError, struct.error, EOFError) as error:
+            advice = "wbm.deploy.log.recover(LOG, NEW) saves what a killed process left"
+            raise ValueError(f"{path} is no finished MCAP log; {advice}") from error
 
 
 def replay(path: str | Path, bundle: Bundle) -> dict[str, float]:

@@ -71,7 +71,7 @@ class SafetyFilter:
         self._last = reading
 
     def _check_form(self, reading: Reading) -> None:
-        if reading.joint_names is None:
+        if not reading.joint_names:
             raise Refused(Fault.DROPPED, "reading has no joint names")
         if tuple(reading.joint_names) != self._names:
             wrong = next(

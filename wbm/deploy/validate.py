@@ -64,7 +64,7 @@ def _check_type(data: Any, expected: str | list[str], where: str) -> None:
     raise ValueError(f"{where} is {type(data).__name__}, expected {' or '.join(names)}")
 
 
-def _check_object(data: dict, schema: dict, where: str) -> None:
+def _check_object(data: dict[str, Any], schema: dict[str, Any], where: str) -> None:
     properties = schema.get("properties", {})
     for key in schema.get("required", ()):
         if key not in data:
@@ -79,7 +79,7 @@ def _check_object(data: dict, schema: dict, where: str) -> None:
             validate(value, extra, f"{where}.{key}")
 
 
-def _check_array(data: list, schema: dict, where: str) -> None:
+def _check_array(data: list[Any], schema: dict[str, Any], where: str) -> None:
     if not schema.get("minItems", 0) <= len(data) <= schema.get("maxItems", len(data)):
         raise ValueError(
             f"{where} has {len(data)} items, expected {schema.get('minItems', 0)} to {schema.get('maxItems', 'any')}"
@@ -89,7 +89,7 @@ def _check_array(data: list, schema: dict, where: str) -> None:
             validate(item, schema["items"], f"{where}[{i}]")
 
 
-def _check_number(data: float, schema: dict, where: str) -> None:
+def _check_number(data: float, schema: dict[str, Any], where: str) -> None:
     if not math.isfinite(data):
         raise ValueError(f"{where} is {data}, expected a finite number")
     if data < schema.get("minimum", -math.inf) or data > schema.get("maximum", math.inf):

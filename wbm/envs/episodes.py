@@ -36,6 +36,7 @@ class Frame:
         ee_distance: grasp frame to the target, m.
         held: whether the hand has hold of the target after the step.
         done: whether the episode ended with this step.
+        scene: index of its scene in the environment's binding.
     """
 
     episode: Tensor
@@ -49,6 +50,7 @@ class Frame:
     ee_distance: Tensor
     held: Tensor
     done: Tensor
+    scene: Tensor
 
 
 @dataclass
@@ -220,7 +222,7 @@ class EpisodeRunner:
         self._count(sight, elapsed, ended)
         self._scene_of_done, self._near = scene, near
         self._code = info["outcome"]
-        return Frame(episode, elapsed, q, poses, sight, action, executed, phase, distance, ended["held"], done)
+        return Frame(episode, elapsed, q, poses, sight, action, executed, phase, distance, ended["held"], done, scene)
 
     def _count(self, sight: Sight | None, elapsed: Tensor, ended: dict[str, Tensor]) -> None:
         t = self._tally

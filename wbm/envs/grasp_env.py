@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 import warp as wp
@@ -42,6 +44,7 @@ class GraspEnv:
         phase: 0 free space, 1 contact-rich [N].
         started_near: episodes that started at the pre-grasp [N].
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
+        claim: given how many episodes start here, how many start before them in other processes and how many in all.
         scene_weight: relative chance of every scene [S] to be drawn; equal until a curriculum changes it.
     """
 
@@ -81,6 +84,7 @@ class GraspEnv:
         self.noise: Tensor | None = None
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
         self.next_episode = 0
+        self.claim: Callable[[int], tuple[int, int]] = lambda count: (0, count)
         self.phase = torch.ones(num_envs, dtype=torch.uint8, device=device)
         self.started_near = torch.ones(num_envs, dtype=torch.bool, device=device)
 
@@ -104,7 +108,7 @@ class GraspEnv:
     def reset(self, first_episode: int = 0) -> Tensor:
         """Start every environment anew with the episodes from `first_episode` on; returns the observation."""
         self.next_episode = first_episode
-        self._begin(torch.arange(self.num_envs, device=self.device))
+        self._begin(torch.arange(self.num_envs, device=self.device), self._claim(self.num_envs))
         self._refresh()
         return self.obs
 
@@ -142,11 +146,15 @@ class GraspEnv:
         self.sim.reset(ids)
         self.randomizer.load(ids, scenes, u)
 
-    def _begin(self, ids: Tensor) -> None:
-        """Start the next episodes in environments `ids` (sorted)."""
-        count = len(ids)
-        episodes = np.arange(self.next_episode, self.next_episode + count)
-        self.next_episode += count
+    def _claim(self, count: int) -> np.ndarray:
+        """The next `count` episode numbers for this process; every process calls at every step."""
+        before, total = self.claim(count)
+        first = self.next_episode + before
+        self.next_episode += total
+        return np.arange(first, first + count)
+
+    def _begin(self, ids: Tensor, episodes: np.ndarray) -> None:
+        """Start `episodes` in environments `ids` (sorted)."""
         u = self._uniforms(episodes)
         table = self.binding.table
         if self.cfg.randomization.scene:
@@ -266,8 +274,9 @@ class GraspEnv:
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
         info |= {"scene": self.scene.clone(), "ctrl": self.ctrl.clone(), "ended": self._ended()}
         ids = done.nonzero().squeeze(1)
+        episodes = self._claim(len(ids))
         if len(ids):
-            self._begin(ids)
+            self._begin(ids, episodes)
             self._refresh()
         return self.obs, reward, done, info
 

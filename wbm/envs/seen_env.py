@@ -45,16 +45,12 @@ class SeenEnv(WholeBodyEnv):
         own |= {name: getattr(self, name) for name in self._EPISODE}
         return super()._live() | own
 
-    _EPISODE = (
-        "phase",
-        "started_near",
-        "_stage",
-        "_contact_since",
-        "_goal_q",
-        "_goal_pos",
-        "_goal_quat",
-        "_settled_goal",
-    )
+    _EPISODE = ("phase", "started_near", "_stage", "_contact_since", "_close_since", "_goal_q", "_goal_pos",
+                "_goal_quat", "_start_q", "_settled_goal", "_corner", "_corners", "_corner_at")  # fmt: skip
+
+    def _plan(self, ids: Tensor, scenes: Tensor, start: Tensor, goal: Tensor) -> None:
+        if self.guided:
+            super()._plan(ids, scenes, start, goal)
 
     def _begin(self, ids: Tensor) -> None:
         first = self.next_episode

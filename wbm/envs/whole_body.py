@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -15,11 +16,16 @@ from wbm.robot import joints
 
 FREE, CONTACT = 0, 1
 NEAR_WAYPOINT = (0.05, 0.3)  # m and rad at which the waypoint counts as passed
-NEAR_PREGRASP = (0.02, 0.15)
+NEAR_PREGRASP = (0.008, 0.06)  # the same at which the pre-grasp counts as reached, with the joints nearly at rest
+GOOD_PREGRASP = (0.02, 0.15)  # and after `LINGER` s of trying, in whatever motion
+LINGER = 1.6
+CALM = (0.04, 0.10)  # m/s of the base and rad/s of arm joints that count as rest
 MAX_CORNERS = 12
 NEAR_CORNER = 0.15  # m at which a corner of the base's way counts as passed
 CARROT = 1.0  # m ahead of the base at which its target moves along the way
 DETOUR_WEIGHTS = {"ee_position": 0.0, "ee_rotation": 0.0, "posture": 0.1, "posture_base": 1.0}
+APPROACH_WEIGHTS = {"posture": 0.05, "posture_base": 0.2}
+"""On the way to the pre-grasp; the body ends where the pre-grasp was solved, not just the hand."""
 
 
 class WholeBodyEnv(GraspEnv):
@@ -27,11 +33,10 @@ class WholeBodyEnv(GraspEnv):
     takes over.
 
     In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed
-    in the
-    world (a target that followed the base would make the controller chase itself), and the posture is the
-    pre-grasp's. Where obstacles block the straight way of the base, the base first follows the planner's corners with
-    the arm held as it is. A teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves
-    through both phases alike.
+    in the world (a target that followed the base would make the controller chase itself), and the posture is the
+    pre-grasp's, base included. Where obstacles block the straight way of the base, the base first follows the
+    planner's corners with the arm held as it is. A teacher's action counts from the moment the pre-grasp is reached.
+    `step_targets` moves through both phases alike.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -40,7 +45,7 @@ class WholeBodyEnv(GraspEnv):
         n, device = self.num_envs, self.device
         self._near = self.columns.add("near")
         self._stage = torch.zeros(n, dtype=torch.int64, device=device)
-        self._contact_since = torch.zeros(n, dtype=torch.int64, device=device)
+        self._contact_since, self._close_since = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(2))
         self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
         self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
         self._corner = torch.zeros(n, MAX_CORNERS, 2, device=device)
@@ -48,9 +53,11 @@ class WholeBodyEnv(GraspEnv):
         self._start_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
         names: list[str] = list(self.controller.weight_names)
         weights = wp.to_torch(self.controller.weights)
-        self._detour = [
-            (weights[:, names.index(k)], v, weights[0, names.index(k)].item()) for k, v in DETOUR_WEIGHTS.items()
-        ]
+        self._weights = []
+        for name, detour in DETOUR_WEIGHTS.items():
+            column = weights[:, names.index(name)]
+            usual = column[0].item()
+            self._weights.append((column, detour, APPROACH_WEIGHTS.get(name, usual), usual))
 
     @property
     def limit_steps(self) -> int:
@@ -62,7 +69,7 @@ class WholeBodyEnv(GraspEnv):
         near = u[:, self._near].squeeze(1) < self.cfg.pregrasp_share
         self._goal_q[ids], self.started_near[ids] = goal, near
         self.phase[ids] = torch.where(near, CONTACT, FREE).to(torch.uint8)
-        self._stage[ids], self._contact_since[ids] = 0, 0
+        self._stage[ids], self._contact_since[ids], self._close_since[ids] = 0, 0, 0
         away = self.binding.table.q_start[scenes].to(goal)
         away[:, joints.HAND] = goal[:, joints.HAND]
         start = torch.where(near.unsqueeze(1), goal, away)
@@ -83,8 +90,8 @@ class WholeBodyEnv(GraspEnv):
             self._corner[env, : len(corners)] = torch.as_tensor(corners, dtype=torch.float32)
             self._corners[env] = len(corners)
 
-    def _begin(self, ids: Tensor) -> None:
-        super()._begin(ids)
+    def _begin(self, ids: Tensor, episodes: np.ndarray) -> None:
+        super()._begin(ids, episodes)
         # The pre-grasp's pose in the world, by the same kinematics that will be asked to reach it.
         keep = self.q_in.clone()
         self.q_in[ids] = self._goal_q[ids].to(self.q_in)
@@ -129,12 +136,17 @@ class WholeBodyEnv(GraspEnv):
         distance, angle = self._errors(self._waypoint(), self._goal_quat)
         passed = free & (self._stage == 0) & (distance < NEAR_WAYPOINT[0]) & (angle < NEAR_WAYPOINT[1])
         self._stage[passed] = 1
+        self._close_since[passed] = self.elapsed[passed]
+        s = self.state
         distance, angle = self._errors(self._goal_pos, self._goal_quat)
-        arrived = free & (self._stage == 1) & (distance < NEAR_PREGRASP[0]) & (angle < NEAR_PREGRASP[1])
-        ids = arrived.nonzero().squeeze(1)
+        calm = (s.qd[:, :2].norm(dim=-1) < CALM[0]) & (s.qd[:, joints.ARM].abs().amax(1) < CALM[1])
+        settled = calm & (distance < NEAR_PREGRASP[0]) & (angle < NEAR_PREGRASP[1])
+        late = (self.elapsed - self._close_since) * self.period > LINGER
+        settled |= late & (distance < GOOD_PREGRASP[0]) & (angle < GOOD_PREGRASP[1])
+        ids = (free & (self._stage == 1) & settled).nonzero().squeeze(1)
         if len(ids):
-            s = self.state
             self.phase[ids], self._contact_since[ids] = CONTACT, self.elapsed[ids]
+            self.posture[ids] = s.q[ids][:, self._body].to(self.posture)
             self.action.reset(ids, s.q[ids].float(), s.ee_pos_w[ids], s.ee_quat[ids])
 
     def _approach(self, free: Tensor) -> None:
@@ -164,14 +176,18 @@ class WholeBodyEnv(GraspEnv):
         ended = (on & (at >= self._corners)).nonzero().squeeze(1)
         on &= at < self._corners
         row = on.unsqueeze(1)
-        for weight, detour, usual in self._detour:
-            weight.copy_(torch.where(on, detour, usual))
+        for weight, detour, approach, usual in self._weights:
+            weight.copy_(torch.where(on, detour, torch.where(self.phase == FREE, approach, usual)))
         way = self._start_q[:, self._body].clone()
         way[:, :2] = base + away * (CARROT / distance.clamp_min(1e-6))
         way[:, 2] = self._goal_q[:, 2]
         goal = self._goal_q[:, self._body].to(self.posture)
         self.posture.copy_(
-            torch.where(row, way.to(self.posture), torch.where(self._corners.unsqueeze(1) > 0, goal, self.posture))
+            torch.where(
+                row,
+                way.to(self.posture),
+                torch.where(((self.phase == FREE) & (self._corners > 0)).unsqueeze(1), goal, self.posture),
+            )
         )
         hold = torch.cat([ids[on], ended])
         if len(hold):

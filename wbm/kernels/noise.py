@@ -42,10 +42,21 @@ class RayNoise:
 @wp.func
 def noise_state(seed: int, key: int, step: int, stream: int, item: int) -> wp.uint32:
     """Generator state of one item, by hashing its coordinates one after the other."""
+    return item_state(noise_stream(seed, key, step, stream), item)
+
+
+@wp.func
+def noise_stream(seed: int, key: int, step: int, stream: int) -> wp.uint32:
+    """What the states of all items of a stream begin with."""
     s = wp.rand_init(seed, key)
     s = wp.rand_init(int(s), step)
-    s = wp.rand_init(int(s), stream)
-    return wp.rand_init(int(s), item)
+    return wp.rand_init(int(s), stream)
+
+
+@wp.func
+def item_state(stream: wp.uint32, item: int) -> wp.uint32:
+    """Generator state of one item of a stream."""
+    return wp.rand_init(int(stream), item)
 
 
 @wp.func
@@ -79,15 +90,15 @@ def noisy_range(
     row: int,
     env: int,
     r: int,
-    key: int,
-    step: int,
+    ray_stream: wp.uint32,
+    burst_stream: wp.uint32,
     level: float,
     max_range: float,
 ) -> float:
     """Measured range of a hit, -1 where the return is lost; `level` scales deviations and chances."""
     t = hit[env, r]
     z = t * ray[row, r][2]
-    state = noise_state(noise.seed, key, step, STREAM_RAY, r)
+    state = item_state(ray_stream, r)
     chance = noise.drop + noise.drop_far * (t / max_range) * (t / max_range)
     if wp.randf(state) < chance * level:
         return -1.0
@@ -95,7 +106,7 @@ def noisy_range(
     if edge and is_edge(ray, hit, row, env, r, z, noise.width, noise.edge_jump):
         return -1.0
     if noise.burst > 0.0:
-        burst_state = noise_state(noise.seed, key, step, STREAM_BURST, r // noise.burst_len)
+        burst_state = item_state(burst_stream, r // noise.burst_len)
         if wp.randf(burst_state) < noise.burst * level:
             return -1.0
     if noise.axial > 0.0:

@@ -61,14 +61,41 @@ def pass_frame(
     env_ids: wp.array[int],  # [n]
     write: wp.array[int],  # [N]
     read: wp.array[int],  # [N]
-    frame: wp.array2d[wp.uint8],  # [N,W] bytes
+    chunk: int,  # words of a thread
+    frame: wp.array2d[wp.uint32],  # [N,W] words
+    # inout:
+    ring_io: wp.array3d[wp.uint32],  # [N,ring,W]
+    # out:
+    frame_out: wp.array2d[wp.uint32],  # [N,W]
+):
+    """Store the new frame's words and hand out the delivered frame's."""
+    i, c = wp.tid()
+    env = env_ids[i]
+    put = write[env]
+    get = read[env]
+    for w in range(c * chunk, wp.min((c + 1) * chunk, frame.shape[1])):
+        ring_io[env, put, w] = frame[env, w]
+        frame_out[env, w] = ring_io[env, get, w]
+
+
+@wp.kernel(enable_backward=False)
+def pass_frame_bytes(
+    # in:
+    env_ids: wp.array[int],  # [n]
+    write: wp.array[int],  # [N]
+    read: wp.array[int],  # [N]
+    chunk: int,  # bytes of a thread
+    frame: wp.array2d[wp.uint8],  # [N,W]
     # inout:
     ring_io: wp.array3d[wp.uint8],  # [N,ring,W]
     # out:
     frame_out: wp.array2d[wp.uint8],  # [N,W]
 ):
-    """Store the new frame's bytes and hand out the delivered frame's."""
-    i, w = wp.tid()
+    """The same for rows that are no whole number of words."""
+    i, c = wp.tid()
     env = env_ids[i]
-    ring_io[env, write[env], w] = frame[env, w]
-    frame_out[env, w] = ring_io[env, read[env], w]
+    put = write[env]
+    get = read[env]
+    for w in range(c * chunk, wp.min((c + 1) * chunk, frame.shape[1])):
+        ring_io[env, put, w] = frame[env, w]
+        frame_out[env, w] = ring_io[env, get, w]

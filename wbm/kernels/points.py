@@ -3,7 +3,15 @@
 # ruff: noqa: RUF046, UP018 (int(0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
-from wbm.kernels.noise import STREAM_SAMPLE, RayNoise, noise_state, noisy_range
+from wbm.kernels.noise import (
+    STREAM_BURST,
+    STREAM_RAY,
+    STREAM_SAMPLE,
+    RayNoise,
+    noise_state,
+    noise_stream,
+    noisy_range,
+)
 from wbm.kernels.se3 import quat_wxyz_normalize, quat_wxyz_rotate_inv
 
 
@@ -45,11 +53,13 @@ def fill_hits(
     rot = sensor_rot[env]
     pos = sensor_pos[env]
     turn = head[env]
+    ray_stream = noise_stream(noise.seed, key[env], step[env], STREAM_RAY)
+    burst_stream = noise_stream(noise.seed, key[env], step[env], STREAM_BURST)
     for r in range(c * chunk, wp.min((c + 1) * chunk, ray.shape[1])):
         inst = slot[env, r]
         t = float(hit[env, r])
         if t >= 0.0 and noise.active != 0:
-            t = noisy_range(noise, ray, hit, row, env, r, key[env], step[env], level[env], max_range)
+            t = noisy_range(noise, ray, hit, row, env, r, ray_stream, burst_stream, level[env], max_range)
         p = t * ray[row, r]
         measured = t
         if planar:

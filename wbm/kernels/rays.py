@@ -1,16 +1,247 @@
 """Ray casting over per-environment instances: placement, bundle culling and exact intersection.
 
 All rays of a sensor start at one point, so everything that depends on the origin alone is computed once an instance
-(`place_instances`). Rays come in bundles of neighbours; an instance enters a bundle's list only if its bounding sphere
-touches the bundle's cone (`cull_bundles`), nearest first, so that a ray stops at the first sphere that starts behind
-its hit (`trace_rays`). Geometry types and sizes use MuJoCo's numbers. Distances are along unit rays, in metres.
+(`place`). Rays come in bundles of neighbours; an instance enters a bundle's list only if it reaches into the bundle's
+cone (`cull`), nearest first, so that rays stop at the first sphere that starts behind their hits (`trace`). Geometry
+types and sizes use MuJoCo's numbers. Distances are along unit rays, in metres.
+
+On a GPU these are three kernels of many threads; on a CPU one thread takes an environment through all three, so that
+its data stay in the cache.
 """
 
-# ruff: noqa: RUF046, SIM109, UP018 (int(0) declares a dynamic variable in a Warp kernel; `in` is not compiled)
+# ruff: noqa: RUF046, UP018 (int(0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
-from wbm.kernels.rays_shapes import BOX, CYLINDER, MESH, PLANE, UNBOUNDED, bounding_radius, is_inside, ray_instance
+from wbm.kernels.rays_cones import is_out, meets, sphere_cone
+from wbm.kernels.rays_data import Bundles, SceneView, Scratch, Slots
+from wbm.kernels.rays_shapes import MESH, UNBOUNDED, bounding_radius, is_inside, ray_instance
 from wbm.kernels.se3 import quat_wxyz_normalize, quat_wxyz_to_mat
+
+
+@wp.func
+def place(
+    # in:
+    env: int,
+    pos: wp.vec3,
+    quat: wp.vec4,  # w x y z
+    exclude_body: int,
+    rays: Bundles,
+    scene: SceneView,
+    # out:
+    slots_out: Slots,
+) -> int:
+    """List the instances that the sensor may see, in its own frame; returns 0 where no ray can be trusted, else 1."""
+    ok = wp.isfinite(pos) and wp.isfinite(quat) and wp.length_sq(quat) > 1.0e-12
+    R_WS = quat_wxyz_to_mat(quat_wxyz_normalize(quat))
+    count = int(0)
+    for i in range(scene.type.shape[1]):
+        kind = scene.type[env, i]
+        body = scene.body[env, i]
+        if ok and kind >= 0 and (body != exclude_body or body < 0):
+            finite = wp.isfinite(scene.quat[env, i])
+            R_WI = quat_wxyz_to_mat(quat_wxyz_normalize(scene.quat[env, i]))
+            p_WI = scene.pos[env, i]
+            if body >= 0:
+                R_WB = quat_wxyz_to_mat(quat_wxyz_normalize(scene.body_quat[env, body]))
+                p_WI = scene.body_pos[env, body] + R_WB * p_WI
+                R_WI = R_WB * R_WI
+                finite = finite and wp.isfinite(scene.body_quat[env, body])
+            offset = p_WI - pos
+            size = scene.size[env, i]
+            mesh = wp.uint64(0)
+            centre = wp.vec3(0.0, 0.0, 0.0)
+            radius = bounding_radius(kind, size)
+            if kind == MESH:
+                index = scene.mesh[env, i]
+                mesh = scene.mesh_ids[index]
+                around = scene.mesh_sphere[index]
+                centre = wp.vec3(around[0], around[1], around[2])
+                radius = around[3]
+                size = scene.mesh_half[index]
+            origin = -wp.transpose(R_WI) * offset
+            if not (finite and wp.isfinite(origin)):
+                ok = False
+            else:
+                c = wp.transpose(R_WS) * (offset + R_WI * centre)
+                distance = wp.length(c)
+                if distance < radius and is_inside(kind, origin, size, mesh, radius):
+                    ok = False
+                along = wp.dot(c, rays.view_axis)
+                aside = wp.sqrt(wp.max(distance * distance - along * along, 0.0))
+                if distance - radius < rays.reach and aside * rays.view_cos - along * rays.view_sin <= radius * 1.001:
+                    slots_out.inst[env, count] = i
+                    slots_out.kind[env, count] = kind
+                    slots_out.size[env, count] = size
+                    slots_out.mesh[env, count] = mesh
+                    slots_out.rot[env, count] = wp.transpose(R_WI) * R_WS
+                    slots_out.origin[env, count] = origin
+                    # Widened, so that rounding never loses a hit.
+                    bound = wp.min(radius * 1.0001 + 1.0e-6 * distance, UNBOUNDED)
+                    power = distance * distance * 0.999999 - bound * bound
+                    slots_out.sphere[env, count] = wp.vec4(c[0], c[1], c[2], power)
+                    slots_out.near[env, count] = wp.max(distance - bound, 0.0)
+                    slots_out.cone[env, count] = sphere_cone(c, distance, bound)
+                    count += 1
+    if ok:
+        slots_out.count[env] = count
+        return 1
+    slots_out.count[env] = 0
+    return 0
+
+
+@wp.func
+def cull(
+    # in:
+    env: int,
+    row: int,  # of the ray table
+    h: int,  # group of bundles
+    rays: Bundles,
+    slots: Slots,
+    # out:
+    work_out: Scratch,
+):
+    """Slots of the instances that may reach into each bundle's cone, sorted by their nearest range."""
+    whole = rays.group_cone[row, h]
+    sin_whole = wp.sqrt(wp.max(1.0 - whole[3] * whole[3], 0.0))
+    # Written always and counted where it fits: a branch that nobody can predict costs more than the test.
+    found = int(0)
+    for s in range(slots.count[env]):
+        work_out.group_slot[env, h, found] = wp.int16(s)
+        found += wp.where(meets(slots.cone[env, s], whole, sin_whole), 1, 0)
+    fewer = int(0)
+    for g in range(h * rays.group, wp.min((h + 1) * rays.group, rays.cone.shape[1])):
+        if g % rays.subgroup == 0:
+            some = rays.subgroup_cone[row, g // rays.subgroup]
+            sin_some = wp.sqrt(wp.max(1.0 - some[3] * some[3], 0.0))
+            fewer = int(0)
+            for m in range(found):
+                s = int(work_out.group_slot[env, h, m])
+                work_out.subgroup_slot[env, h, fewer] = wp.int16(s)
+                fewer += wp.where(meets(slots.cone[env, s], some, sin_some), 1, 0)
+        c4 = rays.cone[row, g]
+        axis = wp.vec3(c4[0], c4[1], c4[2])
+        sin_half = wp.sqrt(wp.max(1.0 - c4[3] * c4[3], 0.0))
+        near_by = int(0)
+        for m in range(fewer):
+            s = int(work_out.subgroup_slot[env, h, m])
+            work_out.slot[env, g, near_by] = wp.int16(s)
+            near_by += wp.where(meets(slots.cone[env, s], c4, sin_half), 1, 0)
+        num = int(0)
+        for m in range(near_by):
+            s = int(work_out.slot[env, g, m])
+            out = bool(False)
+            if c4[3] > 0.0:
+                out = is_out(
+                    slots.kind[env, s], slots.size[env, s], slots.sphere[env, s], slots.origin[env, s],
+                    slots.rot[env, s], axis, c4[3], sin_half,
+                )  # fmt: skip
+            if not out:
+                key = slots.near[env, s]
+                j = int(num)
+                while j > 0 and slots.near[env, int(work_out.slot[env, g, j - 1])] > key:
+                    work_out.slot[env, g, j] = work_out.slot[env, g, j - 1]
+                    j -= 1
+                work_out.slot[env, g, j] = wp.int16(s)
+                num += 1
+        work_out.count[env, g] = num
+
+
+@wp.func
+def trace(
+    # in:
+    env: int,
+    row: int,  # of the ray table
+    c: int,  # chunk of rays
+    rays: Bundles,
+    slots: Slots,
+    # inout:
+    work_io: Scratch,
+    # out:
+    range_out: wp.array2d[float],  # [N,R] -1 where nothing is hit
+    instance_out: wp.array2d[int],  # [N,R] -1 where nothing is hit
+):
+    """Nearest hit of every ray of a chunk along its bundle's list."""
+    first = c * rays.chunk
+    end = wp.min(first + rays.chunk, rays.direction.shape[1])
+    g = first // rays.bundle
+    part = first // rays.part
+    part_end = (end + rays.part - 1) // rays.part
+    for k in range(first, end):
+        work_io.best[env, k] = rays.reach
+        work_io.inst[env, k] = -1
+    for b in range(part, part_end):
+        work_io.far[env, b] = rays.reach
+    # A part, and the chunk, is done with when all its hits lie before the next sphere. The data of an instance are
+    # left in memory until a ray meets its sphere.
+    farthest = float(rays.reach)
+    for j in range(work_io.count[env, g]):
+        s = int(work_io.slot[env, g, j])
+        start = slots.near[env, s]
+        if start > farthest:
+            break
+        s4 = slots.sphere[env, s]
+        centre = wp.vec3(s4[0], s4[1], s4[2])
+        around = slots.cone[env, s]
+        farthest = float(0.0)
+        for b in range(part, part_end):
+            far = work_io.far[env, b]
+            if start <= far:
+                c4 = rays.part_cone[row, b]
+                if meets(around, c4, wp.sqrt(wp.max(1.0 - c4[3] * c4[3], 0.0))):
+                    far = float(0.0)
+                    for k in range(b * rays.part, wp.min((b + 1) * rays.part, end)):
+                        best = work_io.best[env, k]
+                        if start <= best:
+                            d = rays.direction[row, k]
+                            along = wp.dot(centre, d)
+                            if s4[3] <= 0.0 or (along > 0.0 and along * along >= s4[3]):
+                                t = ray_instance(
+                                    slots.kind[env, s], slots.origin[env, s], slots.rot[env, s] * d,
+                                    slots.size[env, s], slots.mesh[env, s], best,
+                                )  # fmt: skip
+                                if t < best:
+                                    best = t
+                                    work_io.best[env, k] = t
+                                    work_io.inst[env, k] = slots.inst[env, s]
+                        far = wp.max(far, best)
+                    work_io.far[env, b] = far
+            farthest = wp.max(farthest, far)
+    for k in range(first, end):
+        out = rays.order[row, k]
+        inst = work_io.inst[env, k]
+        instance_out[env, out] = inst
+        if inst >= 0:
+            range_out[env, out] = work_io.best[env, k]
+        else:
+            range_out[env, out] = -1.0
+
+
+@wp.kernel(enable_backward=False)
+def cast_rays(
+    # in:
+    env_ids: wp.array[int],  # [n]
+    pattern: wp.array[int],  # [N] row of the ray table
+    sensor_pos: wp.array[wp.vec3],  # [N]
+    sensor_quat: wp.array[wp.vec4],  # [N] w x y z
+    exclude_body: int,
+    rays: Bundles,
+    scene: SceneView,
+    # scratch:
+    slots_scratch: Slots,
+    work_scratch: Scratch,
+    # out:
+    ok_out: wp.array[int],  # [N]
+    range_out: wp.array2d[float],  # [N,R]
+    instance_out: wp.array2d[int],  # [N,R]
+):
+    """All three steps for one environment a thread."""
+    env = env_ids[wp.tid()]
+    row = pattern[env]
+    ok_out[env] = place(env, sensor_pos[env], sensor_quat[env], exclude_body, rays, scene, slots_scratch)
+    for h in range(rays.group_cone.shape[1]):
+        cull(env, row, h, rays, slots_scratch, work_scratch)
+    for c in range((rays.direction.shape[1] + rays.chunk - 1) // rays.chunk):
+        trace(env, row, c, rays, slots_scratch, work_scratch, range_out, instance_out)
 
 
 @wp.kernel(enable_backward=False)
@@ -20,179 +251,31 @@ def place_instances(
     sensor_pos: wp.array[wp.vec3],  # [N]
     sensor_quat: wp.array[wp.vec4],  # [N] w x y z
     exclude_body: int,
-    view_axis: wp.vec3,  # sensor frame
-    view_cos: float,
-    view_sin: float,
-    max_range: float,
-    body_pos: wp.array2d[wp.vec3],  # [N,B]
-    body_quat: wp.array2d[wp.vec4],  # [N,B] w x y z
-    inst_type: wp.array2d[int],  # [N,I]
-    inst_size: wp.array2d[wp.vec3],
-    inst_mesh: wp.array2d[int],
-    inst_body: wp.array2d[int],
-    inst_pos: wp.array2d[wp.vec3],
-    inst_quat: wp.array2d[wp.vec4],
-    mesh_ids: wp.array[wp.uint64],  # [K]
-    mesh_sphere: wp.array[wp.vec4],  # [K] centre, radius
+    rays: Bundles,
+    scene: SceneView,
     # out:
+    slots_out: Slots,
     ok_out: wp.array[int],  # [N]
-    count_out: wp.array[int],  # [N]
-    inst_out: wp.array2d[int],  # [N,I] slot -> instance
-    kind_out: wp.array2d[int],
-    size_out: wp.array2d[wp.vec3],
-    mesh_out: wp.array2d[wp.uint64],
-    rot_out: wp.array2d[wp.mat33],  # sensor frame -> instance frame
-    origin_out: wp.array2d[wp.vec3],  # sensor origin in the instance frame
-    sphere_out: wp.array2d[wp.vec4],  # centre c of the bounding sphere in the sensor frame, |c|^2 - r^2
-    cone_out: wp.array2d[wp.vec4],  # direction of its centre, cosine of its angular radius
-    near_out: wp.array2d[float],  # its nearest range, 0 if it holds the sensor
 ):
-    """List the instances that the sensor may see, in its own frame; `ok` is 0 where no ray can be trusted."""
+    """`place` with a thread an environment."""
     env = env_ids[wp.tid()]
-    pos = sensor_pos[env]
-    quat = sensor_quat[env]
-    ok = wp.isfinite(pos) and wp.isfinite(quat) and wp.length_sq(quat) > 1.0e-12
-    R_WS = quat_wxyz_to_mat(quat_wxyz_normalize(quat))
-    count = int(0)
-    for i in range(inst_type.shape[1]):
-        kind = inst_type[env, i]
-        body = inst_body[env, i]
-        if ok and kind >= 0 and (body != exclude_body or body < 0):
-            finite = wp.isfinite(inst_quat[env, i])
-            R_WI = quat_wxyz_to_mat(quat_wxyz_normalize(inst_quat[env, i]))
-            p_WI = inst_pos[env, i]
-            if body >= 0:
-                R_WB = quat_wxyz_to_mat(quat_wxyz_normalize(body_quat[env, body]))
-                p_WI = body_pos[env, body] + R_WB * p_WI
-                R_WI = R_WB * R_WI
-                finite = finite and wp.isfinite(body_quat[env, body])
-            offset = p_WI - pos
-            size = inst_size[env, i]
-            mesh = wp.uint64(0)
-            centre = wp.vec3(0.0, 0.0, 0.0)
-            radius = bounding_radius(kind, size)
-            if kind == MESH:
-                index = inst_mesh[env, i]
-                mesh = mesh_ids[index]
-                centre = wp.vec3(mesh_sphere[index][0], mesh_sphere[index][1], mesh_sphere[index][2])
-                radius = mesh_sphere[index][3]
-            origin = -wp.transpose(R_WI) * offset
-            if not (finite and wp.isfinite(origin)):
-                ok = False
-            else:
-                c = wp.transpose(R_WS) * (offset + R_WI * centre)
-                distance = wp.length(c)
-                if distance < radius and is_inside(kind, origin, size, mesh, radius):
-                    ok = False
-                along = wp.dot(c, view_axis)
-                aside = wp.sqrt(wp.max(distance * distance - along * along, 0.0))
-                if distance - radius < max_range and aside * view_cos - along * view_sin <= radius * 1.001:
-                    inst_out[env, count] = i
-                    kind_out[env, count] = kind
-                    size_out[env, count] = size
-                    mesh_out[env, count] = mesh
-                    rot_out[env, count] = wp.transpose(R_WI) * R_WS
-                    origin_out[env, count] = origin
-                    # Widened, so that rounding never loses a hit.
-                    bound = wp.min(radius * 1.0001 + 1.0e-6 * distance, UNBOUNDED)
-                    sphere_out[env, count] = wp.vec4(c[0], c[1], c[2], distance * distance * 0.999999 - bound * bound)
-                    near_out[env, count] = wp.max(distance - bound, 0.0)
-                    u = c / wp.max(distance, 1.0e-9)
-                    sine = wp.min(bound / wp.max(distance, 1.0e-9), 1.0)
-                    cone_out[env, count] = wp.vec4(u[0], u[1], u[2], wp.sqrt(1.0 - sine * sine))
-                    count += 1
-    if ok:
-        ok_out[env] = 1
-        count_out[env] = count
-    else:
-        ok_out[env] = 0
-        count_out[env] = 0
-
-
-@wp.func
-def is_leaving(kind: int, o: wp.vec3, size: wp.vec3, axis: wp.vec3, cos_half: float, sin_half: float) -> bool:
-    """Whether a flat face's outer half space holds the origin and every ray of a cone leads further out.
-
-    For a box, a plane and the ends of a cylinder, in the instance's frame.
-
-    The least component of a cone's directions along a face normal n is `cos(angle(axis, n) + half)`.
-    """
-    for i in range(3):
-        extent = size[i]
-        if kind == PLANE:
-            extent = 0.0
-        if kind == CYLINDER:
-            extent = size[1]
-        side = wp.sign(o[i])
-        if (kind == BOX or i == 2) and wp.abs(o[i]) > extent:
-            a = side * axis[i]
-            if a * cos_half - wp.sqrt(wp.max(1.0 - a * a, 0.0)) * sin_half > 1.0e-4:
-                return True
-    return False
-
-
-@wp.func
-def cones_meet(cone: wp.vec4, cos_other: float, axis_other: wp.vec3) -> bool:
-    """Whether two cones with one apex overlap: the angle between their axes is at most the sum of their half angles."""
-    sines = wp.sqrt(wp.max(1.0 - cone[3] * cone[3], 0.0) * wp.max(1.0 - cos_other * cos_other, 0.0))
-    between = cone[0] * axis_other[0] + cone[1] * axis_other[1] + cone[2] * axis_other[2]
-    return cos_other < 0.0 or between >= cone[3] * cos_other - sines - 1.0e-5
+    ok_out[env] = place(env, sensor_pos[env], sensor_quat[env], exclude_body, rays, scene, slots_out)
 
 
 @wp.kernel(enable_backward=False)
 def cull_bundles(
     # in:
     env_ids: wp.array[int],  # [n]
-    pattern: wp.array[int],  # [N] row of the ray table
-    cone: wp.array2d[wp.vec4],  # [Q,G] axis, cosine of the half angle
-    group_cone: wp.array2d[wp.vec4],  # [Q,G'] the same around `group` bundles
-    group: int,
-    count: wp.array[int],  # [N]
-    slot_cone: wp.array2d[wp.vec4],  # [N,I]
-    near: wp.array2d[float],  # [N,I]
-    kind: wp.array2d[int],
-    size: wp.array2d[wp.vec3],
-    rot: wp.array2d[wp.mat33],
-    origin: wp.array2d[wp.vec3],
-    # scratch:
-    group_scratch: wp.array3d[wp.int16],  # [N,G',I]
+    pattern: wp.array[int],  # [N]
+    rays: Bundles,
+    slots: Slots,
     # out:
-    cand_count_out: wp.array2d[int],  # [N,G]
-    cand_out: wp.array3d[wp.int16],  # [N,G,I] slots, nearest first
+    work_out: Scratch,
 ):
-    """Slots whose bounding sphere meets each bundle's cone and that lie ahead, sorted by their nearest range."""
+    """`cull` with a thread a group."""
     i, h = wp.tid()
     env = env_ids[i]
-    row = pattern[env]
-    whole = group_cone[row, h]
-    axis = wp.vec3(whole[0], whole[1], whole[2])
-    found = int(0)
-    for s in range(count[env]):
-        if near[env, s] <= 0.0 or cones_meet(slot_cone[env, s], whole[3], axis):
-            group_scratch[env, h, found] = wp.int16(s)
-            found += 1
-    for g in range(h * group, wp.min((h + 1) * group, cone.shape[1])):
-        c4 = cone[row, g]
-        axis = wp.vec3(c4[0], c4[1], c4[2])
-        sin_half = wp.sqrt(wp.max(1.0 - c4[3] * c4[3], 0.0))
-        num = int(0)
-        for m in range(found):
-            s = int(group_scratch[env, h, m])
-            key = near[env, s]
-            if key <= 0.0 or cones_meet(slot_cone[env, s], c4[3], axis):
-                leaving = bool(False)
-                shape = kind[env, s]
-                if c4[3] > 0.0 and (shape == BOX or shape == PLANE or shape == CYLINDER):
-                    ahead = rot[env, s] * axis
-                    leaving = is_leaving(shape, origin[env, s], size[env, s], ahead, c4[3], sin_half)
-                if not leaving:
-                    j = int(num)
-                    while j > 0 and near[env, int(cand_out[env, g, j - 1])] > key:
-                        cand_out[env, g, j] = cand_out[env, g, j - 1]
-                        j -= 1
-                    cand_out[env, g, j] = wp.int16(s)
-                    num += 1
-        cand_count_out[env, g] = num
+    cull(env, pattern[env], h, rays, slots, work_out)
 
 
 @wp.kernel(enable_backward=False)
@@ -200,66 +283,15 @@ def trace_rays(
     # in:
     env_ids: wp.array[int],  # [n]
     pattern: wp.array[int],  # [N]
-    direction: wp.array2d[wp.vec3],  # [Q,R] unit, bundle order, sensor frame
-    order: wp.array2d[int],  # [Q,R] bundle order -> ray
-    bundle: int,
-    chunk: int,  # rays of a thread
-    max_range: float,
-    slot_inst: wp.array2d[int],  # [N,I]
-    kind: wp.array2d[int],
-    size: wp.array2d[wp.vec3],
-    mesh: wp.array2d[wp.uint64],
-    rot: wp.array2d[wp.mat33],
-    origin: wp.array2d[wp.vec3],
-    sphere: wp.array2d[wp.vec4],
-    near: wp.array2d[float],
-    cand_count: wp.array2d[int],  # [N,G]
-    cand: wp.array3d[wp.int16],  # [N,G,I]
+    rays: Bundles,
+    slots: Slots,
     # scratch:
-    best_scratch: wp.array2d[float],  # [N,R] bundle order
-    inst_scratch: wp.array2d[int],  # [N,R]
+    work_scratch: Scratch,
     # out:
-    range_out: wp.array2d[float],  # [N,R] -1 where nothing is hit
-    instance_out: wp.array2d[int],  # [N,R] -1 where nothing is hit
+    range_out: wp.array2d[float],  # [N,R]
+    instance_out: wp.array2d[int],  # [N,R]
 ):
-    """Nearest hit of every ray along its bundle's list."""
+    """`trace` with a thread a chunk."""
     i, c = wp.tid()
     env = env_ids[i]
-    row = pattern[env]
-    first = c * chunk
-    end = wp.min(first + chunk, direction.shape[1])
-    g = first // bundle
-    for k in range(first, end):
-        best_scratch[env, k] = max_range
-        inst_scratch[env, k] = -1
-    # A sphere is loaded once for all rays of the thread, which stops when all its hits lie before the next sphere. The
-    # rest of an instance's data is left in memory until a ray meets its sphere.
-    farthest = float(max_range)
-    for j in range(cand_count[env, g]):
-        s = int(cand[env, g, j])
-        start = near[env, s]
-        if start > farthest:
-            break
-        s4 = sphere[env, s]
-        centre = wp.vec3(s4[0], s4[1], s4[2])
-        farthest = float(0.0)
-        for k in range(first, end):
-            best = best_scratch[env, k]
-            if start <= best:
-                d = direction[row, k]
-                along = wp.dot(centre, d)
-                if s4[3] <= 0.0 or (along > 0.0 and along * along >= s4[3]):
-                    t = ray_instance(kind[env, s], origin[env, s], rot[env, s] * d, size[env, s], mesh[env, s], best)
-                    if t < best:
-                        best = t
-                        best_scratch[env, k] = t
-                        inst_scratch[env, k] = slot_inst[env, s]
-            farthest = wp.max(farthest, best)
-    for k in range(first, end):
-        out = order[row, k]
-        inst = inst_scratch[env, k]
-        instance_out[env, out] = inst
-        if inst >= 0:
-            range_out[env, out] = best_scratch[env, k]
-        else:
-            range_out[env, out] = -1.0
+    trace(env, pattern[env], c, rays, slots, work_scratch, range_out, instance_out)

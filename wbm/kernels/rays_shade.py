@@ -3,6 +3,7 @@
 # ruff: noqa: UP018 (float(0.0) declares a dynamic variable in a Warp kernel)
 import warp as wp
 
+from wbm.kernels.rays_data import SceneView, Slots
 from wbm.kernels.rays_shapes import BOX, CAPSULE, CYLINDER, MESH, PLANE, SPHERE, ray_instance
 from wbm.kernels.se3 import quat_wxyz_normalize, quat_wxyz_to_mat
 
@@ -47,25 +48,10 @@ def shade_rays(
     cam_quat: wp.array[wp.vec4],  # [1] w x y z
     hit: wp.array2d[float],  # [1,R]
     hit_inst: wp.array2d[int],  # [1,R]
-    body_pos: wp.array2d[wp.vec3],  # [1,B]
-    body_quat: wp.array2d[wp.vec4],
-    inst_type: wp.array2d[int],  # [1,I]
-    inst_size: wp.array2d[wp.vec3],
-    inst_mesh: wp.array2d[int],
-    inst_body: wp.array2d[int],
-    inst_pos: wp.array2d[wp.vec3],
-    inst_quat: wp.array2d[wp.vec4],
-    inst_color: wp.array2d[wp.vec3],
-    mesh_ids: wp.array[wp.uint64],
+    scene: SceneView,  # one environment
+    inst_color: wp.array2d[wp.vec3],  # [1,I]
     light_pos: wp.array[wp.vec3],  # [K] samples of one area light
-    light_count: wp.array[int],  # [K] instances as placed from each light sample
-    light_kind: wp.array2d[int],  # [K,I]
-    light_size: wp.array2d[wp.vec3],
-    light_mesh: wp.array2d[wp.uint64],
-    light_rot: wp.array2d[wp.mat33],
-    light_origin: wp.array2d[wp.vec3],
-    light_sphere: wp.array2d[wp.vec4],
-    light_near: wp.array2d[float],
+    light: Slots,  # instances as placed from each light sample
     # out:
     rgb_out: wp.array[wp.vec3],  # [R] linear
 ):
@@ -79,18 +65,18 @@ def shade_rays(
         return
     t = hit[0, r]
     p = cam_pos[0] + t * d
-    R_WI = quat_wxyz_to_mat(quat_wxyz_normalize(inst_quat[0, i]))
-    p_WI = inst_pos[0, i]
-    body = inst_body[0, i]
+    R_WI = quat_wxyz_to_mat(quat_wxyz_normalize(scene.quat[0, i]))
+    p_WI = scene.pos[0, i]
+    body = scene.body[0, i]
     if body >= 0:
-        R_WB = quat_wxyz_to_mat(quat_wxyz_normalize(body_quat[0, body]))
-        p_WI = body_pos[0, body] + R_WB * p_WI
+        R_WB = quat_wxyz_to_mat(quat_wxyz_normalize(scene.body_quat[0, body]))
+        p_WI = scene.body_pos[0, body] + R_WB * p_WI
         R_WI = R_WB * R_WI
-    kind = inst_type[0, i]
+    kind = scene.type[0, i]
     R_IW = wp.transpose(R_WI)
-    n = surface_normal(kind, R_IW * (p - p_WI), inst_size[0, i])
+    n = surface_normal(kind, R_IW * (p - p_WI), scene.size[0, i])
     if kind == MESH:
-        query = wp.mesh_query_ray(mesh_ids[inst_mesh[0, i]], R_IW * (cam_pos[0] - p_WI), R_IW * d, 2.0 * t + 1.0)
+        query = wp.mesh_query_ray(scene.mesh_ids[scene.mesh[0, i]], R_IW * (cam_pos[0] - p_WI), R_IW * d, 2.0 * t + 1.0)
         n = wp.normalize(query.normal)
     n = R_WI * n
     if wp.dot(n, d) > 0.0:
@@ -109,15 +95,15 @@ def shade_rays(
         facing = -wp.dot(n, u)
         if facing > 0.0:
             free = float(1.0)
-            for s in range(light_count[k]):
-                s4 = light_sphere[k, s]
+            for s in range(light.count[k]):
+                s4 = light.sphere[k, s]
                 along = s4[0] * u[0] + s4[1] * u[1] + s4[2] * u[2]
-                aside = wp.vec3(s4[0], s4[1], s4[2]) - along * u
-                if free > 0.0 and along - s4[3] < distance and wp.dot(aside, aside) <= s4[3] * s4[3]:
+                ahead = s4[3] <= 0.0 or (along > 0.0 and along * along >= s4[3])
+                if free > 0.0 and light.near[k, s] < distance and ahead:
                     limit = distance - SHADOW_BIAS
-                    u_I = light_rot[k, s] * u
+                    u_I = light.rot[k, s] * u
                     met = ray_instance(
-                        light_kind[k, s], light_origin[k, s], u_I, light_size[k, s], light_mesh[k, s], limit
+                        light.kind[k, s], light.origin[k, s], u_I, light.size[k, s], light.mesh[k, s], limit
                     )
                     if met < limit:
                         free = 0.0

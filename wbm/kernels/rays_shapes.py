@@ -169,6 +169,18 @@ def bounding_radius(kind: int, size: wp.vec3) -> float:
 
 
 @wp.func
+def support(kind: int, n: wp.vec3, size: wp.vec3) -> float:
+    """Farthest extent of a bounded geometry about its own centre along a unit vector; `size` of a mesh is its box."""
+    if kind == SPHERE:
+        return size[0]
+    if kind == CAPSULE:
+        return size[0] + size[1] * wp.abs(n[2])
+    if kind == CYLINDER:
+        return size[0] * wp.sqrt(n[0] * n[0] + n[1] * n[1]) + size[1] * wp.abs(n[2])
+    return size[0] * wp.abs(n[0]) + size[1] * wp.abs(n[1]) + size[2] * wp.abs(n[2])
+
+
+@wp.func
 def is_inside(kind: int, o: wp.vec3, size: wp.vec3, mesh: wp.uint64, mesh_radius: float) -> bool:
     """Whether a point in the instance's frame lies strictly inside it (below it, for a plane)."""
     if kind == PLANE:

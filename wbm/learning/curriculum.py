@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -45,9 +47,13 @@ class Curriculum:
         self._tally[0].index_add_(0, group, torch.ones_like(won))
         self._tally[1].index_add_(0, group, won)
 
-    def update(self) -> None:
-        """Move the running success by what was counted and set the weights anew; forgets the counts."""
-        tried, won = self._tally
+    def update(self, total: Callable[[Tensor], Tensor] = lambda tally: tally) -> None:
+        """Move the running success by what was counted and set the weights anew; forgets the counts.
+
+        Args:
+            total: sums the counts over the processes that train together.
+        """
+        tried, won = total(self._tally)
         gain = 1.0 - (1.0 - RATE) ** tried
         self.success += gain * (won / tried.clamp(min=1.0) - self.success)
         self._tally.zero_()

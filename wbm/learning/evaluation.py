@@ -68,7 +68,8 @@ class BlockResult:
 class EvaluationWorld:
     """Environment, sensors and policy of a process."""
 
-    def __init__(self, job: BlockJob) -> None:
+    def __init__(self, job: BlockJob, watch: bool = False) -> None:
+        """`watch` gives the sensors to a teacher too, which does without them."""
         self.job = job
         self.assets = load_assets(job.assets)
         suite = load_suite({job.policy.name: job.policy}, job.device) if job.kind == "teacher" else None
@@ -82,7 +83,7 @@ class EvaluationWorld:
         phrasing = self.bank.text_held_out if job.split == "test" else self.bank.text
         self.sentence = phrasing[:, 0]
         perception, schema, texts = None, PolicySchema(), None
-        if job.kind != "teacher":
+        if watch or job.kind != "teacher":
             perception = Perception(
                 self.env.robot, self.assets.objects, self.bank, job.sensors, schema, job.num_envs, job.seed, job.device
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ from wbm.learning.curve import save_curve
 from wbm.learning.teacher_checkpoint import load_checkpoint, save_checkpoint
 from wbm.learning.teacher_evaluation import evaluate_teacher
 from wbm.learning.teacher_policy import TeacherSpec, load_teacher, save_teacher
+from wbm.learning.team import Team
+from wbm.learning.team_ppo import TeamGaussian, TeamPPO
 
 
 @dataclass
@@ -36,6 +39,7 @@ class Progress:
         evaluation: success of the last deterministic evaluation, NaN before the first.
         steps_per_s: environment steps a second.
         time_left_s: at this pace, to the last iteration.
+        stopping: it was asked to stop; everything is in the checkpoint.
     """
 
     iteration: int
@@ -45,6 +49,7 @@ class Progress:
     evaluation: float
     steps_per_s: float
     time_left_s: float
+    stopping: bool = False
 
 
 def train_teacher(
@@ -56,6 +61,8 @@ def train_teacher(
     scratch: Path,
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
+    team: Team | None = None,
+    stopping: Callable[[], bool] = lambda: False,
 ) -> dict[str, float]:
     """Train to the last iteration, a plateau or the target, and keep the best policy under `directory`.
 
@@ -69,6 +76,9 @@ def train_teacher(
         scratch: holds the checkpoint and the newest policy.
         seed: of network and exploration; the environments have their own.
         report: called after each iteration.
+        team: the processes that train together, each with its share of the environments; None is this one alone.
+            All but the leader give a `directory` of their own, which is of no further use.
+        stopping: whether to write a checkpoint after this iteration in any case, and tell `report`.
 
     Returns:
         `success` of the best evaluation, `iterations` and `env_steps` trained, `train_seconds` of this call.
@@ -80,19 +90,24 @@ def train_teacher(
 
     for folder in (directory, scratch):
         folder.mkdir(parents=True, exist_ok=True)
+    team = team or Team()
+    num_envs = env.num_envs * team.size
     torch.manual_seed(seed)
+    env.claim = team.numbers
     env.reset()
-    alg = make_ppo(env, ppo)
+    alg = make_ppo(env, ppo, team)
     spec = teacher_spec(env, cfg, ppo)
     curriculum = Curriculum(env, cfg.curriculum)
     curve: dict[str, list[float]] = {}
-    start, best, stale = load_checkpoint(scratch / "checkpoint.pt", alg, env, curriculum, curve)
+    start, best, stale = load_checkpoint(scratch / "checkpoint.pt", alg, env, curriculum, curve, team)
     obs = env.obs
     writer = SummaryWriter(str(directory / "logs"), purge_step=start)
     began = time.monotonic()
     evaluation = curve["evaluation"][-1] if curve.get("evaluation") else float("nan")
 
     for iteration in range(start, cfg.iterations):
+        if best >= cfg.target or (cfg.patience and stale >= cfg.patience):
+            break
         left = 1 - iteration / cfg.iterations
         alg.entropy_coef = ppo.entropy * left
         if ppo.schedule == "linear":
@@ -110,7 +125,7 @@ def train_teacher(
                 terms += info["terms"].mean(0).cpu()
                 outcomes += torch.bincount(info["outcome"].long(), minlength=len(REASONS)).cpu()
                 curriculum.count(info["scene"][done], info["outcome"][done])
-            curriculum.update()
+            curriculum.update(team.sum)
             alg.compute_returns(_observation(obs))
 
         # Learn
@@ -118,6 +133,9 @@ def train_teacher(
         _watch(env, iteration, scratch, weights=torch.cat([p.flatten() for p in alg.actor.parameters()]))
 
         # Log
+        figures = team.sum(torch.cat([torch.tensor([rewards_sum]), terms, outcomes]))
+        rewards_sum, terms = float(figures[0]) / team.size, figures[1 : 1 + len(terms)] / team.size
+        outcomes = figures[-len(outcomes) :]
         finished = float(outcomes[RUNNING + 1 :].sum())
         row = {
             "reward": rewards_sum / ppo.steps,
@@ -130,7 +148,8 @@ def train_teacher(
 
         # Evaluate, keep the best
         last = iteration + 1 == cfg.iterations
-        if (iteration + 1) % cfg.eval_every == 0 or last:
+        due = (iteration + 1) % cfg.eval_every == 0 or last
+        if due and team.leads:
             save_teacher(scratch / "latest", spec, alg.actor.state_dict())
             result = evaluate_teacher(eval_env, load_teacher(scratch / "latest", env.device), cfg.eval_episodes)
             evaluation = result["success"]
@@ -139,6 +158,9 @@ def train_teacher(
             if evaluation > best:
                 best = evaluation
                 save_teacher(directory, spec, alg.actor.state_dict())
+        if due:
+            evaluation, best, stale = team.tell([evaluation, best, float(stale)])
+            team.same_random()
         row["evaluation"] = evaluation
         for name, value in row.items():
             curve.setdefault(name, [float("nan")] * iteration).append(value)
@@ -146,37 +168,39 @@ def train_teacher(
         for values in curve.values():
             values.extend([float("nan")] * (iteration + 1 - len(values)))
 
-        if (iteration + 1) % cfg.checkpoint_every == 0 or last:
-            save_checkpoint(scratch / "checkpoint.pt", alg, env, curriculum, curve, iteration + 1, best, stale)
+        halt = team.any(stopping())
+        if (iteration + 1) % cfg.checkpoint_every == 0 or last or halt:
+            path = scratch / "checkpoint.pt"
+            save_checkpoint(path, alg, env, curriculum, curve, iteration + 1, best, stale, team)
         if report is not None:
             done_now, elapsed = iteration + 1 - start, time.monotonic() - began
-            pace = done_now * ppo.steps * env.num_envs / max(elapsed, 1e-9)
+            pace = done_now * ppo.steps * num_envs / max(elapsed, 1e-9)
             left = elapsed / done_now * (cfg.iterations - iteration - 1)
-            report(Progress(iteration + 1, cfg.iterations, row["reward"], row["success"], evaluation, pace, left))
-        if best >= cfg.target or (cfg.patience and stale >= cfg.patience):
-            break
+            report(Progress(iteration + 1, cfg.iterations, row["reward"], row["success"], evaluation, pace, left, halt))
 
     writer.close()
     trained = len(curve["reward"])
-    save_curve(directory, curve, ppo.steps * env.num_envs, cfg.name)
+    save_curve(directory, curve, ppo.steps * num_envs, cfg.name)
     return {
         "success": best,
         "iterations": float(trained),
-        "env_steps": float(trained * ppo.steps * env.num_envs),
+        "env_steps": float(trained * ppo.steps * num_envs),
         "train_seconds": time.monotonic() - began,
     }
 
 
-def make_ppo(env: GraspEnv, ppo: PpoConfig) -> PPO:
-    """rsl_rl's PPO with actor, critic and storage for `env`."""
+def make_ppo(env: GraspEnv, ppo: PpoConfig, team: Team | None = None) -> PPO:
+    """rsl_rl's PPO with actor, critic and storage for `env`, or its counterpart for a team of several."""
     obs = _observation(env.obs)
     groups = {"actor": ["teacher"], "critic": ["teacher"]}
     sizes = {"hidden_dims": list(ppo.hidden), "activation": ppo.activation}
-    noise = {"class_name": "GaussianDistribution", "init_std": ppo.init_std, "std_type": "log"}
+    kind = "GaussianDistribution" if team is None or team.size == 1 else TeamGaussian
+    noise = {"class_name": kind, "init_std": ppo.init_std, "std_type": "log"}
     actor = MLPModel(obs, groups, "actor", env.num_actions, distribution_cfg=noise, **sizes)
     critic = MLPModel(obs, groups, "critic", 1, **sizes)
     storage = RolloutStorage("rl", env.num_envs, ppo.steps, obs, [env.num_actions], env.device)
-    alg = PPO(
+    make = PPO if team is None or team.size == 1 else partial(TeamPPO, team=team)
+    alg = make(
         actor,
         critic,
         storage,

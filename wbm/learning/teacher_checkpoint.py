@@ -11,6 +11,7 @@ from rsl_rl.algorithms import PPO
 
 from wbm.envs.grasp_env import GraspEnv
 from wbm.learning.curriculum import Curriculum
+from wbm.learning.team import Team
 
 
 def save_checkpoint(
@@ -21,14 +22,19 @@ def save_checkpoint(
     curve: dict[str, list[float]],
     iteration: int,
     best: float,
-    stale: int,
+    stale: float,
+    team: Team,
 ) -> None:
-    """Write everything that the next iteration depends on, atomically."""
+    """Write everything that the next iteration depends on, atomically; every rank calls, the leader writes."""
+    environments = team.save_env(env)
+    if environments is None:
+        return
     state = {
         **alg.save(),
         "learning_rate": alg.learning_rate,
         "rng": torch.get_rng_state(),
-        "env": env.state_dict(),
+        "cuda_rng": torch.cuda.get_rng_state(env.device) if torch.device(env.device).type == "cuda" else None,
+        "env": environments,
         "curriculum": curriculum.success,
         "curve": curve,
         "iteration": iteration,
@@ -46,8 +52,8 @@ def save_checkpoint(
 
 
 def load_checkpoint(
-    path: Path, alg: PPO, env: GraspEnv, curriculum: Curriculum, curve: dict[str, list[float]]
-) -> tuple[int, float, int]:
+    path: Path, alg: PPO, env: GraspEnv, curriculum: Curriculum, curve: dict[str, list[float]], team: Team
+) -> tuple[int, float, float]:
     """Restore a checkpoint where there is one; fills `curve`.
 
     Returns:
@@ -58,8 +64,10 @@ def load_checkpoint(
     state = torch.load(path, weights_only=True, map_location=env.device)
     alg.load(state, None, strict=True)
     alg.learning_rate = state["learning_rate"]
-    env.load_state_dict(state["env"])
+    team.load_env(env, state["env"])
     curriculum.success.copy_(state["curriculum"])
     torch.set_rng_state(state["rng"].cpu())
+    if state["cuda_rng"] is not None:
+        torch.cuda.set_rng_state(state["cuda_rng"].cpu(), env.device)
     curve.update(state["curve"])
     return state["iteration"], state["best"], state["stale"]

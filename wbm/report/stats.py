@@ -104,7 +104,7 @@ def percent(value: float | None) -> str:
     if value is None:
         return "–"
     digits = 1 if 0 < value < 0.02 or 0.98 < value < 1 else 0
-    return f"{100 * value:.{digits}f} %"
+    return f"{100 * value:.{digits}f}\u00a0%"
 
 
 def verdict(name: str, arms: Sequence[dict[str, Any]]) -> list[str]:

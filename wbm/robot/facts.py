@@ -78,10 +78,10 @@ class Entry:
         return value
 
     def vector(self, count: int) -> np.ndarray:
-        """Finite numbers [count]: a list, or text with spaces, as in MJCF."""
+        """Finite numbers [count]: a list, text with spaces as in MJCF, or a lone number."""
         items = self.value.split() if isinstance(self.value, str) else self.value
         try:
-            vector = np.array(items, dtype=np.float64)
+            vector = np.atleast_1d(np.array(items, dtype=np.float64))
         except (TypeError, ValueError):
             vector = np.empty(0)
         if vector.shape != (count,) or not np.isfinite(vector).all():

@@ -50,6 +50,11 @@ class Assets:
         (folder / REPORT).write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
+def robot_of(folder: Path) -> RobotModel:
+    """The robot of an assets folder: the user's own where the folder holds its facts."""
+    return load_robot(folder / ROBOT if (folder / ROBOT).is_file() else "")
+
+
 def load_assets(path: Path | str) -> Assets:
     """Read an assets folder.
 
@@ -61,9 +66,8 @@ def load_assets(path: Path | str) -> Assets:
     missing = [name for name in (OBJECTS, SCENES, TEXTS) if not (folder / name).is_file()]
     if missing:
         raise FileNotFoundError(f"{folder} is not an assets artifact: lacks {', '.join(missing)}")
-    robot = load_robot(folder / ROBOT) if (folder / ROBOT).is_file() else load_robot()
     objects, texts = ObjectSet.load(folder / OBJECTS), Texts.load(folder / TEXTS)
-    assets = Assets(objects, SceneBank.load(folder / SCENES), texts, robot)
+    assets = Assets(objects, SceneBank.load(folder / SCENES), texts, robot_of(folder))
     scenes, texts = assets.scenes, assets.texts
     if len(scenes) and scenes.object.max() >= len(assets.objects):
         raise ValueError(f"{folder}: scenes name object {scenes.object.max()}, the set has {len(assets.objects)}")

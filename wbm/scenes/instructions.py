@@ -50,6 +50,11 @@ class Texts:
             return Texts(data["sentence"], data["embedding"])
 
 
+def _fits(noun: str, other: str) -> bool:
+    """Whether a noun may mean a thing called `other` too: "car" fits a "toy car", "object" fits everything."""
+    return set(noun.split()) <= {*other.split(), "object"}
+
+
 def descriptions(objects: ObjectSet, bank: SceneBank, scene: int) -> list[str]:
     """Phrases that fit the target of a scene and nothing else in it, the plainest first.
 
@@ -62,10 +67,13 @@ def descriptions(objects: ObjectSet, bank: SceneBank, scene: int) -> list[str]:
     def words(o: int) -> dict[str, str]:
         return {"size": str(objects.size_word[o]), "color": str(objects.color[o]), "noun": str(objects.noun[o])}
 
+    def meant(keys: tuple[str, ...], other: dict[str, str]) -> bool:
+        return all(_fits(mine[k], other[k]) if k == "noun" else mine[k] == other[k] for k in keys)
+
     mine, rest = words(target), [words(int(chosen[i])) for i in others]
     phrases = []
     for keys in (("color", "noun"), ("noun",), ("size", "color", "noun"), ("size", "noun"), ("color",), ("size",)):
-        if all(mine[k] for k in keys) and all(any(r[k] != mine[k] for k in keys) for r in rest):
+        if all(mine[k] for k in keys) and not any(meant(keys, other) for other in rest):
             phrase = " ".join(mine[k] for k in keys)
             phrases.append(phrase if "noun" in keys else f"{phrase} object")
     if len(others) == 0:
@@ -73,14 +81,14 @@ def descriptions(objects: ObjectSet, bank: SceneBank, scene: int) -> list[str]:
     inverse = bank.support_quat[scene, 0] * np.array([1.0, -1.0, -1.0, -1.0])
     local = rotate(inverse, bank.object_pos[scene])
     for i, words_i in zip(others, rest, strict=True):
-        same = [j for j in others if words(int(chosen[j]))["noun"] == words_i["noun"]]
-        if len(same) > 1 or words_i["noun"] == mine["noun"]:
+        same = [other for other in rest if _fits(words_i["noun"], other["noun"])]
+        if len(same) > 1 or _fits(words_i["noun"], mine["noun"]):
             continue  # the reference must itself be unambiguous
         offset = local[0, 1] - local[i, 1]
         if abs(offset) > SIDE_MARGIN and abs(offset) > abs(local[0, 0] - local[i, 0]):
             side = "left" if offset > 0 else "right"
             beyond = [j for j in others if j != i and (local[j, 1] - local[i, 1]) * offset > 0]
-            if not any(words(int(chosen[j]))["noun"] == mine["noun"] for j in beyond):
+            if not any(_fits(mine["noun"], words(int(chosen[j]))["noun"]) for j in beyond):
                 phrases.append(f"{mine['noun']} to the {side} of the {words_i['noun']}")
     left = local[0, 1] - local[others, 1]
     near = local[others, 0] - local[0, 0]

@@ -41,7 +41,7 @@ class Layout:
 
 def draw_layout(kind: str, rng: np.random.Generator, cfg: ScenesConfig) -> Layout:
     """One support of the given kind with random dimensions."""
-    return {"table": _table, "shelf": _shelf, "bin": _bin}[kind](rng, cfg)
+    return LAYOUTS[kind](rng, cfg)
 
 
 def _boxes(rows: list[tuple[tuple[float, ...], tuple[float, ...]]]) -> dict[str, np.ndarray]:
@@ -120,3 +120,7 @@ def _bin(rng: np.random.Generator, cfg: ScenesConfig) -> Layout:
         target_high=np.array([b - margin, y - margin]),
         wall_gap=0.008,
     )
+
+
+LAYOUTS = {"table": _table, "shelf": _shelf, "bin": _bin}
+"""How each kind of `config.KINDS` is drawn."""

@@ -21,6 +21,9 @@ GRASP_WIDTH = 0.09
 """Largest smallest dimension (m): at least one way around the object must fit into the hand."""
 
 OPEN_EDGES = 0.05
+MAX_ELEMENTS = 8
+"""Array elements a face: three corners, and at most as many vertices with position, normal, colour and two textures."""
+
 _HEADER = 1 << 16
 
 
@@ -65,7 +68,7 @@ def check_bounds(path: Path, cfg: ObjectsConfig) -> None:
         declared = _declared_glb(path, size)
     elif path.suffix.lower() == ".stl":
         declared = _declared_stl(path, size)
-    if declared > 3 * cfg.max_faces:
+    if declared > MAX_ELEMENTS * cfg.max_faces:
         raise MeshError(f"declares {declared:.3g} elements, more than objects.max_faces={cfg.max_faces} allows")
 
 
@@ -110,6 +113,8 @@ def _declared_glb(path: Path, size: int) -> int:
             raise MeshError(f"truncated: announces {total} bytes, holds {size}")
         try:
             tree = json.loads(stream.read(length))
+            if any("uri" in b and not str(b["uri"]).startswith("data:") for b in tree.get("buffers", ())):
+                raise MeshError("refers to another file: a GLB must hold its own buffers")
             accessors = [int(a.get("count", 0)) for a in tree.get("accessors", ())]
             if any(count < 0 for count in accessors):
                 raise MeshError("negative accessor count")
@@ -123,7 +128,7 @@ def _declared_glb(path: Path, size: int) -> int:
             raise
         except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
             raise MeshError(f"malformed GLB tree ({type(error).__name__})") from None
-    return max([0, *accessors, sum(instances)])
+    return max(sum(accessors), sum(instances))
 
 
 def _as_mesh(loaded: object, max_faces: int) -> trimesh.Trimesh:

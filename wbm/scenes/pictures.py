@@ -46,7 +46,7 @@ def render(
     return (np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
-def object_sheet(objects: ObjectSet, path: Path, size: tuple[int, int] = (112, 112), columns: int = 12) -> None:
+def object_sheet(objects: ObjectSet, path: Path, size: tuple[int, int] = (128, 112), columns: int = 12) -> None:
     """One tile an object, at most `MAX_OBJECTS` spread over the set, all at the same scale."""
     shown = np.unique(np.linspace(0, len(objects) - 1, min(len(objects), MAX_OBJECTS)).round().astype(int))
     tiles = []
@@ -58,7 +58,7 @@ def object_sheet(objects: ObjectSet, path: Path, size: tuple[int, int] = (112, 1
     _write_sheet(tiles, columns, path)
 
 
-def scene_sheet(assets: Assets, path: Path, size: tuple[int, int] = (256, 192)) -> None:
+def scene_sheet(assets: Assets, path: Path, size: tuple[int, int] = (320, 240)) -> None:
     """One tile a scene, at most `MAX_SCENES` spread over the kinds, each with the robot at its start."""
     objects, bank = assets.objects, assets.scenes
     model = SceneModel(objects, SceneModelConfig(num_distractors=bank.num_distractors), robot=assets.robot)
@@ -74,8 +74,8 @@ def scene_sheet(assets: Assets, path: Path, size: tuple[int, int] = (256, 192)) 
         data = mujoco.MjData(compiled)
         mujoco.mj_resetDataKeyframe(compiled, data, 0)
         mujoco.mj_forward(compiled, data)
-        middle = 0.65 * bank.object_pos[k, 0] + 0.35 * np.array([*bank.q_start[k, :2], 0.5])
-        image = render(compiled, data, middle + np.array([-1.2, -1.9, 1.1]), middle - [0.0, 0.0, 0.05], size, 42.0)
+        middle = np.array([*(0.6 * bank.object_pos[k, 0] + 0.4 * bank.q_start[k, :3])[:2], 0.45])
+        image = render(compiled, data, middle + np.array([-1.2, -1.9, 1.3]), middle, size, 44.0)
         tiles.append(
             (image, f"{KINDS[bank.kind[k]]}: {objects.color[bank.object[k, 0]]} {objects.noun[bank.object[k, 0]]}")
         )
@@ -109,5 +109,7 @@ def _write_sheet(tiles: list[tuple[np.ndarray, str]], columns: int, path: Path) 
     for i, (image, text) in enumerate(tiles):
         x, y = (i % columns) * width, (i // columns) * (height + caption)
         sheet.paste(Image.fromarray(image), (x, y))
-        draw.text((x + 3, y + height + 1), text[: width // 6], fill=(40, 40, 40))
+        while draw.textlength(text) > width - 4:
+            text = text[:-1]
+        draw.text((x + 3, y + height + 1), text, fill=(40, 40, 40))
     sheet.save(path, optimize=True)

@@ -22,6 +22,7 @@ COLORS: dict[str, tuple[float, float, float]] = {
     "brown": (0.42, 0.26, 0.14),
     "cyan": (0.15, 0.72, 0.78),
 }
+SIZE_WORDS = ("tall", "flat", "large", "small")
 _HALF = np.sqrt(0.5)
 SIDEWAYS = ((_HALF, _HALF, 0.0, 0.0), (_HALF, 0.0, _HALF, 0.0))
 

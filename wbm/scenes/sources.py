@@ -19,9 +19,10 @@ from wbm.scenes.isolate import run_isolated
 from wbm.scenes.meshfile import SUFFIXES
 from wbm.scenes.objects import ObjectEntry, ObjectSet, stack_objects
 from wbm.scenes.parts import IDENTITY, hull_part
-from wbm.scenes.procedural import COLORS, draw_mass, draw_objects, size_word
+from wbm.scenes.procedural import COLORS, SIZE_WORDS, draw_mass, draw_objects, size_word
 
 TIMEOUT = 300.0
+_FILLER = {"mesh", "model", "textured", "visual", "collision", "obj", "blob", "object", *SIZE_WORDS, *COLORS}
 MEMORY_MB = 6000
 MIN_FAMILIES = 5
 """With at least this many folders, two of them are held out as whole families."""
@@ -191,8 +192,11 @@ def imported_entry(
 
 
 def noun_of(stem: str) -> str:
-    """Words of a file's name without numbers and filler; `object` when none are left."""
+    """Words of a file's name without numbers, filler, colours and sizes; `object` when none are left.
+
+    Colours and sizes are drawn for imported meshes: a "red toy" that is blue would mislead.
+    """
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", stem)
     words = re.findall(r"[a-z]{3,}", spaced.lower())
-    words = [w for w in words if w not in ("mesh", "model", "textured", "visual", "collision", "obj", "blob")]
+    words = [w for w in words if w not in _FILLER]
     return " ".join(words[:3]) or "object"

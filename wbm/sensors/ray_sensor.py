@@ -9,8 +9,9 @@ import warp as wp
 
 from wbm.kernels.noise import RayNoise, aim_sensors
 from wbm.kernels.points import fill_hits
-from wbm.kernels.rays import cull_bundles, place_instances, trace_rays
-from wbm.sensors.bundles import BUNDLE, GROUP, RayTable, build_table
+from wbm.kernels.rays import cast_rays, cull_bundles, place_instances, trace_rays
+from wbm.kernels.rays_data import Bundles, Scratch, Slots
+from wbm.sensors.bundles import BUNDLE, GROUP, SUBGROUP, RayTable, build_table, common_part
 from wbm.sensors.config import ExtrinsicNoise
 from wbm.sensors.scene import RayScene
 
@@ -48,6 +49,7 @@ class RaySensor:
         noise: RayNoise | None = None,  # pyright: ignore[reportGeneralTypeIssues]
         extrinsic: ExtrinsicNoise | None = None,
         seed: int = 0,
+        keep_slots: bool = False,
     ) -> None:
         """Sort the rays and allocate outputs for every environment.
 
@@ -62,33 +64,46 @@ class RaySensor:
             noise: error model of each return; None is exact.
             extrinsic: mounting error; None is exact.
             seed: of all noise.
+            keep_slots: whether `slots` holds every environment's instances after `trace`, for other kernels to use.
         """
         self.scene, self.min_range, self.max_range, self.planar = scene, float(min_range), float(max_range), planar
         self.exclude_body, self.bundle, self.seed, self._turn = int(exclude_body), bundle, int(seed), float(turn)
+        self._keep_slots = keep_slots
         self.noise, self.extrinsic = noise or RayNoise(), extrinsic or ExtrinsicNoise()
         self.noise.seed = self.seed
         # A corner ray is longer than its planar depth.
         self.reach = self.max_range / float(rays[..., 2].min()) if planar else self.max_range
-        self.table: RayTable = build_table(rays, bundle)
         self.num_envs, self.num_rays = scene.num_envs, rays.shape[1]
         # A CPU thread takes a whole bundle, which spares the cost of starting a thread a ray.
         self._chunk = bundle if scene.device.is_cpu else 1
-        self._upload_table()
+        part = common_part(self._chunk)
+        self.table: RayTable = build_table(rays, bundle, part)
+        self._bundles = self._upload_table(part)
         self._allocate()
 
-    def _upload_table(self) -> None:
+    def _upload_table(self, part: int) -> Bundles:
         table, device = self.table, self.scene.device
+
+        def vectors(value: np.ndarray, dtype: type) -> wp.array:
+            return wp.array(value.astype(np.float32), dtype=dtype, device=device)
+
+        self.rays = vectors(table.rays, wp.vec3)
+        out = Bundles()
         in_order = np.take_along_axis(table.rays, table.order[:, :, None].astype(np.int64), axis=1)
-        self.rays = wp.array(table.rays.astype(np.float32), dtype=wp.vec3, device=device)
-        self._sorted = wp.array(in_order.astype(np.float32), dtype=wp.vec3, device=device)
-        self._order = wp.array(table.order, dtype=wp.int32, device=device)
-        self._cone = wp.array(table.cone.astype(np.float32), dtype=wp.vec4, device=device)
-        self._group_cone = wp.array(table.group_cone.astype(np.float32), dtype=wp.vec4, device=device)
+        out.direction, out.order = vectors(in_order, wp.vec3), wp.array(table.order, dtype=wp.int32, device=device)
+        out.cone, out.group_cone = vectors(table.cone, wp.vec4), vectors(table.group_cone, wp.vec4)
+        out.subgroup_cone = vectors(table.subgroup_cone, wp.vec4)
+        out.part_cone = vectors(table.part_cone, wp.vec4)
+        out.bundle, out.group, out.subgroup = self.bundle, GROUP, SUBGROUP
+        out.part, out.chunk = part, self._chunk
+        axis, half = table.view
+        out.view_axis, out.view_cos, out.view_sin = wp.vec3(*axis), float(np.cos(half)), max(float(np.sin(half)), 0.0)
+        out.reach = self.reach
+        return out
 
     def _allocate(self) -> None:
         n, device = self.num_envs, self.scene.device
-        envs, hits, slots = (n,), (n, self.num_rays), (n, self.scene.num_instances)
-        bundles = (n, self.table.cone.shape[1])
+        envs, hits = (n,), (n, self.num_rays)
 
         def new(shape: tuple[int, ...], dtype: type) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -101,19 +116,45 @@ class RaySensor:
         self.pattern, self.ok = new(envs, wp.int32), new(envs, wp.int32)
         self.true_pos, self.true_quat = new(envs, wp.vec3), new(envs, wp.vec4)
         self._head, self._rotation = new(envs, wp.mat33), new(envs, wp.mat33)
-        self._count = new(envs, wp.int32)
-        self._inst, self._kind = new(slots, wp.int32), new(slots, wp.int32)
-        self._size, self._mesh = new(slots, wp.vec3), new(slots, wp.uint64)
-        self._rot, self._origin = new(slots, wp.mat33), new(slots, wp.vec3)
-        self._sphere, self._slot_cone, self._near = new(slots, wp.vec4), new(slots, wp.vec4), new(slots, wp.float32)
-        self._cand_count, self._cand = new(bundles, wp.int32), new((*bundles, slots[1]), wp.int16)
-        self._group = new((n, self._group_cone.shape[1], slots[1]), wp.int16)
-        self._best, self._best_inst = new(hits, wp.float32), new(hits, wp.int32)
+        self._memory: list[wp.array] = []
+        self.slots, self._work = self._new_slots(), self._new_work()
         self.true_range, self.true_instance = new(hits, wp.float32), new(hits, wp.int32)
         self.range, self.depth = new(hits, wp.float32), new(hits, wp.float32)
         self.instance, self.id = new(hits, wp.int32), new(hits, wp.int32)
         self.color, self.valid = new(hits, wp.vec3), new(hits, wp.bool)
         self.point_s, self.point_w = new(hits, wp.vec3), new(hits, wp.vec3)
+
+    def _temporary(self, shape: tuple[int, ...], dtype: type) -> wp.array:
+        """An array [N,...] that holds nothing from one kernel to the next.
+
+        Kernels on a CPU run on one thread: there, environments follow each other in the same memory, which stays in the
+        cache.
+        """
+        device, n = self.scene.device, self.num_envs
+        shared = device.is_cpu and n > 1 and not self._keep_slots
+        memory = wp.zeros((1 if shared else n, *shape), dtype=dtype, device=device)
+        if not shared:
+            return memory
+        self._memory.append(memory)
+        strides = (0, *memory.strides[1:])
+        return wp.array(ptr=memory.ptr, dtype=dtype, shape=(n, *shape), strides=strides, device=device)
+
+    def _new_slots(self) -> Slots:
+        out, new, num = Slots(), self._temporary, (self.scene.num_instances,)
+        out.count, out.inst, out.kind = new((), wp.int32), new(num, wp.int32), new(num, wp.int32)
+        out.size, out.mesh, out.rot = new(num, wp.vec3), new(num, wp.uint64), new(num, wp.mat33)
+        out.origin, out.sphere, out.cone = new(num, wp.vec3), new(num, wp.vec4), new(num, wp.vec4)
+        out.near = new(num, wp.float32)
+        return out
+
+    def _new_work(self) -> Scratch:
+        out, new, num = Scratch(), self._temporary, self.scene.num_instances
+        groups, bundles = self.table.group_cone.shape[1], self.table.cone.shape[1]
+        out.group_slot, out.slot = new((groups, num), wp.int16), new((bundles, num), wp.int16)
+        out.subgroup_slot = new((groups, num), wp.int16)
+        out.count, out.far = new((bundles,), wp.int32), new((self.table.part_cone.shape[1],), wp.float32)
+        out.best, out.inst = new((self.num_rays,), wp.float32), new((self.num_rays,), wp.int32)
+        return out
 
     def env_index(self, env_ids: EnvIds) -> wp.array:
         """Device array of environment indices; all of them for None.
@@ -143,11 +184,10 @@ class RaySensor:
 
     def trace(self, ids: wp.array) -> None:
         """Fill `true_range` and `ok` of the given environments."""
-        s, device, num = self.scene, self.scene.device, ids.shape[0]
-        axis, half = self.table.view
+        device = self.scene.device
         wp.launch(
             aim_sensors,
-            dim=num,
+            dim=ids.shape[0],
             inputs=[
                 ids, self.step, self.key, self.level, self.seed, self.extrinsic.sigma_pos, self.extrinsic.sigma_rot,
                 self._turn, self.table.rays.shape[0], self.pos, self.quat,
@@ -155,47 +195,45 @@ class RaySensor:
             outputs=[self.pattern, self.true_pos, self.true_quat, self._head, self._rotation],
             device=device,
         )  # fmt: skip
+        (self._cast_at_once if device.is_cpu else self._cast_in_steps)(ids)
+
+    def _cast_at_once(self, ids: wp.array) -> None:
+        """A thread an environment."""
+        wp.launch(
+            cast_rays,
+            dim=ids.shape[0],
+            inputs=[
+                ids, self.pattern, self.true_pos, self.true_quat, self.exclude_body, self._bundles, self.scene.view,
+                self.slots, self._work,
+            ],
+            outputs=[self.ok, self.true_range, self.true_instance],
+            device=self.scene.device,
+        )  # fmt: skip
+
+    def _cast_in_steps(self, ids: wp.array) -> None:
+        """Many threads an environment; needs memory of its own for each environment."""
+        num, device = ids.shape[0], self.scene.device
         wp.launch(
             place_instances,
             dim=num,
-            inputs=[
-                ids, self.true_pos, self.true_quat, self.exclude_body, wp.vec3(*axis), float(np.cos(half)),
-                max(float(np.sin(half)), 0.0), self.reach, s.body_pos, s.body_quat, s.type, s.size, s.mesh, s.body,
-                s.pos, s.quat, s.mesh_ids, s.mesh_sphere,
-            ],
-            outputs=[
-                self.ok, self._count, self._inst, self._kind, self._size, self._mesh, self._rot, self._origin,
-                self._sphere, self._slot_cone, self._near,
-            ],
+            inputs=[ids, self.true_pos, self.true_quat, self.exclude_body, self._bundles, self.scene.view],
+            outputs=[self.slots, self.ok],
             device=device,
-        )  # fmt: skip
+        )
         wp.launch(
             cull_bundles,
-            dim=(num, self._group_cone.shape[1]),
-            inputs=[
-                ids, self.pattern, self._cone, self._group_cone, GROUP, self._count, self._slot_cone, self._near,
-                self._kind, self._size, self._rot, self._origin, self._group,
-            ],
-            outputs=[self._cand_count, self._cand],
+            dim=(num, self.table.group_cone.shape[1]),
+            inputs=[ids, self.pattern, self._bundles, self.slots],
+            outputs=[self._work],
             device=device,
-        )  # fmt: skip
+        )
         wp.launch(
             trace_rays,
             dim=(num, -(-self.num_rays // self._chunk)),
-            inputs=[
-                ids, self.pattern, self._sorted, self._order, self.bundle, self._chunk, self.reach, self._inst,
-                self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near, self._cand_count,
-                self._cand, self._best, self._best_inst,
-            ],
+            inputs=[ids, self.pattern, self._bundles, self.slots, self._work],
             outputs=[self.true_range, self.true_instance],
             device=device,
-        )  # fmt: skip
-
-    @property
-    def placed(self) -> tuple[wp.array, ...]:
-        """Instances as the last `trace` listed them: count [N]; kind, size, mesh, rotation and origin in the instance's
-        frame, bounding sphere in the sensor's and its nearest range [N,I]."""
-        return self._count, self._kind, self._size, self._mesh, self._rot, self._origin, self._sphere, self._near
+        )
 
     def fill(self, ids: wp.array) -> None:
         """Apply the noise and derive depth, ids, colour, flags and points of the given environments."""

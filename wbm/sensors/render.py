@@ -77,7 +77,8 @@ class Renderer:
         if self._sensors is None or self._shape != shape:
             around = np.concatenate([np.eye(3), -np.eye(3)])[None]
             camera = RaySensor(scene.like(1), self._rays, 0.0, FAR)
-            self._sensors, self._shape = (camera, RaySensor(scene.like(len(self._lights)), around, 0.0, FAR)), shape
+            light = RaySensor(scene.like(len(self._lights)), around, 0.0, FAR, keep_slots=True)
+            self._sensors, self._shape = (camera, light), shape
         return self._sensors
 
     def _shade(self, camera: RaySensor, light: RaySensor) -> np.ndarray:
@@ -87,9 +88,8 @@ class Renderer:
             shade_rays,
             dim=num,
             inputs=[
-                camera.rays, camera.true_pos, camera.true_quat, camera.true_range, camera.true_instance, s.body_pos,
-                s.body_quat, s.type, s.size, s.mesh, s.body, s.pos, s.quat, s.color, s.mesh_ids, light.true_pos,
-                *light.placed,
+                camera.rays, camera.true_pos, camera.true_quat, camera.true_range, camera.true_instance, s.view,
+                s.color, light.true_pos, light.slots,
             ],
             outputs=[rgb],
             device=s.device,

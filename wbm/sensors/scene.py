@@ -9,6 +9,7 @@ from enum import IntEnum
 import numpy as np
 import warp as wp
 
+from wbm.kernels.rays_data import SceneView
 from wbm.robot.model import RobotModel
 
 PLANE, SPHERE, CAPSULE, CYLINDER, BOX, MESH = 0, 2, 3, 5, 6, 7
@@ -98,6 +99,7 @@ class RayScene:
         body_pos: `wp.array` [N,B] of vec3, metres, world frame; live input.
         body_quat: `wp.array` [N,B] of vec4, w x y z; live input.
         type, size, mesh, body, pos, quat, id, color: `wp.array`s [N,I], written by `update_envs`.
+        view: the same, as the kernels take it.
     """
 
     def __init__(
@@ -143,9 +145,19 @@ class RayScene:
             setattr(self, f.name, wp.array(value, dtype=dtypes.get(f.name, wp.int32), device=self.device))
         self._meshes: list[wp.Mesh] = []
         self._spheres: list[np.ndarray] = []
+        self._halves: list[np.ndarray] = []
         self.mesh_ids = wp.zeros(1, dtype=wp.uint64, device=self.device)
         self.mesh_sphere = wp.zeros(1, dtype=wp.vec4, device=self.device)
+        self.mesh_half = wp.zeros(1, dtype=wp.vec3, device=self.device)
+        self.view = SceneView()
+        for name in ("body_pos", "body_quat", "type", "size", "mesh", "body", "pos", "quat"):
+            setattr(self.view, name, getattr(self, name))
+        self._show_meshes()
         self.add_meshes(meshes)
+
+    def _show_meshes(self) -> None:
+        for name in ("mesh_ids", "mesh_sphere", "mesh_half"):
+            setattr(self.view, name, getattr(self, name))
 
     def _shared(self, array: wp.array | None, shape: tuple, dtype: type, name: str) -> wp.array:
         if array is None:
@@ -176,6 +188,8 @@ class RayScene:
             centre = (vertices.min(0) + vertices.max(0)) / 2
             radius = np.linalg.norm(vertices - centre, axis=1).max()
             self._spheres.append(np.array([*centre, radius], np.float32))
+            # Widened, so that rounding never loses a hit.
+            self._halves.append(np.ptp(vertices, axis=0) * 0.5001 + 1e-6)
             self._meshes.append(
                 wp.Mesh(
                     points=wp.array(vertices, dtype=wp.vec3, device=self.device),
@@ -187,6 +201,8 @@ class RayScene:
             ids = np.array([m.id for m in self._meshes], np.uint64)
             self.mesh_ids = wp.array(ids, dtype=wp.uint64, device=self.device)
             self.mesh_sphere = wp.array(np.stack(self._spheres), dtype=wp.vec4, device=self.device)
+            self.mesh_half = wp.array(np.stack(self._halves), dtype=wp.vec3, device=self.device)
+            self._show_meshes()
         return list(range(first, len(self._meshes)))
 
     def update_envs(self, env_ids: Sequence[int] | np.ndarray, instances: Sequence[Instances] | Instances) -> None:
@@ -215,8 +231,9 @@ class RayScene:
     def like(self, num_envs: int) -> RayScene:
         """A scene of unused instances with the same numbers of bodies and instances, sharing this one's meshes."""
         other = RayScene(num_envs, self.num_bodies, self.num_instances, device=str(self.device))
-        other._meshes, other._spheres = list(self._meshes), list(self._spheres)
-        other.mesh_ids, other.mesh_sphere = self.mesh_ids, self.mesh_sphere
+        other._meshes, other._spheres, other._halves = list(self._meshes), list(self._spheres), list(self._halves)
+        other.mesh_ids, other.mesh_sphere, other.mesh_half = self.mesh_ids, self.mesh_sphere, self.mesh_half
+        other._show_meshes()
         return other
 
     def copy_envs(self, source: RayScene, env_ids: Sequence[int] | np.ndarray) -> None:

@@ -119,7 +119,11 @@ def make_simulation(model: mujoco.MjModel, num_envs: int, cfg: SimConfig, device
         if device != "cpu":
             raise ValueError(f"sim.engine=mjbatch runs on the CPU, not on {device!r}")
         return MjBatchSimulation(model, num_envs, cfg.threads)
-    raise ValueError(f"sim.engine={cfg.engine} is not available in this version; use sim.engine=mjbatch")
+    try:
+        from wbm.sim.mujoco_warp_engine import MujocoWarpSimulation
+    except ModuleNotFoundError as error:
+        raise ValueError("sim.engine=mujoco_warp needs MuJoCo Warp: pip install 'wbm[gpu]'") from error
+    return MujocoWarpSimulation(model, num_envs, device)
 
 
 def env_ids(ids: torch.Tensor) -> np.ndarray:
