@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
+import inspect
 import io
 import json
 import os
@@ -163,19 +164,19 @@ def watch_units(log: Path) -> None:
 
         def wrapper(*arguments: Any, **options: Any) -> Any:
             if before:
-                note(text(*arguments))
+                note(text(*arguments, **options))
             result = real(*arguments, **options)
             if not before:
-                note(text(*arguments))
+                note(text(*arguments, **options))
             return result
 
         setattr(owner, name, wrapper)
 
     wrap(rollouts, "work", lambda job: f"rollouts shard {job.shard}", before=False)
     wrap(evaluation, "work", lambda job: f"evaluation block {job.first}", before=False)
-    wrap(
-        teacher, "save_checkpoint", lambda _p, _a, _e, _c, iteration, *_: f"teacher iteration {iteration}", before=True
-    )
+    saving = inspect.signature(teacher.save_checkpoint)
+    iteration = lambda *a, **k: f"teacher iteration {saving.bind(*a, **k).arguments['iteration']}"
+    wrap(teacher, "save_checkpoint", iteration, before=True)
     wrap(distill._Run, "save", lambda run: f"distill step {run.step}", before=True)
     wrap(Draft, "publish", lambda draft: f"publish {draft.manifest.kind}", before=True)
 
