@@ -49,6 +49,8 @@ def loaded() -> tuple[Simulation, list[tuple[mujoco.MjModel, mujoco.MjData]]]:
     return sim, alone
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1200)  # the first time, Warp compiles the collision kernels
 def test_scenes_step_and_touch_as_in_mujoco_c() -> None:
     sim, alone = loaded()
     touching = 0
