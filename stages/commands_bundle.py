@@ -43,6 +43,7 @@ def replay_log(log: str, path: str, overrides: Sequence[str], as_json: bool) -> 
     """
     from wbm.deploy.log import replay
 
+    composer(overrides)  # a wrong setting is named first
     if not Path(log).is_file():
         raise ConfigError(f"{log}: no such file; name a log that RunLog or `wbm bundle soak --log FILE` wrote")
     _print(replay(log, _open(path, overrides)), as_json)
@@ -91,9 +92,9 @@ def compare(overrides: Sequence[str], as_json: bool) -> None:
 def _open(path: str, overrides: Sequence[str]) -> Bundle:
     from wbm.deploy.bundle import Bundle
 
-    place = Path(path)
+    place, config = Path(path), composer(overrides)
     if not place.exists() and (path.startswith("bundle/") or is_reference(path)):
-        place = open_store(composer(overrides)).resolve(path, ("bundle",)).path
+        place = open_store(config).resolve(path, ("bundle",)).path
     if not place.exists():
         raise ConfigError(f"{path}: no such file; name a bundle's file, its folder, or bundle/NAME in the store")
     return Bundle.open(place / "policy.wbm" if place.is_dir() else place)

@@ -79,6 +79,7 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
     from wbm.envs.world import WorldConfig
     from wbm.learning.evaluation import BlockJob
     from wbm.learning.workers import run_jobs
+    from wbm.sim.simulation import default_device
 
     e, policy = cfg.evaluation, inputs["policy"]
     world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
@@ -93,7 +94,7 @@ def _play(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> list[d
             first, min(BLOCK, e.episodes - first), blocks, inputs["assets"].path, policy.path,
             policy.manifest.kind, world,
             cfg.sensors, split, e.start, e.condition, min(e.num_envs, e.episodes), e.record_episodes,
-            cfg.seed + e.seed,
+            cfg.seed + e.seed, default_device(cfg.sim),
         )
         for first in range(0, e.episodes, BLOCK)
     ]  # fmt: skip

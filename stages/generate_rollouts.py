@@ -78,10 +78,12 @@ def uses_gpu(cfg: Any) -> bool:
 def _job(cfg: Any, inputs: dict[str, Any], shard: int, folder: Path) -> Any:
     from wbm.envs.world import WorldConfig
     from wbm.learning.rollouts import ShardJob
+    from wbm.sim.simulation import default_device
 
     world = WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env)
     teachers = {slot.partition("/")[2]: art.path for slot, art in inputs.items() if slot.startswith("teacher/")}
-    return ShardJob(shard, folder, inputs["assets"].path, teachers, world, cfg.sensors, cfg.rollouts, cfg.seed)
+    device = default_device(cfg.sim)
+    return ShardJob(shard, folder, inputs["assets"].path, teachers, world, cfg.sensors, cfg.rollouts, cfg.seed, device)
 
 
 def _report(reports: Path, shard: int) -> Path:

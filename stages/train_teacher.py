@@ -39,8 +39,9 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     from wbm.learning.team import Team
     from wbm.scenes.assets import load_assets
     from wbm.sim.config import evaluation_physics
+    from wbm.sim.simulation import default_device
 
-    teacher, device = cfg.teacher, "cuda" if cfg.sim.engine == "mujoco_warp" and torch.cuda.is_available() else "cpu"
+    teacher, device = cfg.teacher, default_device(cfg.sim)
     torch.set_num_threads(max(1, cfg.sim.threads))
     assets = load_assets(inputs["assets"].path)
     world = with_start(WorldConfig(cfg.robot, cfg.sim, cfg.wbc, cfg.env), "local")

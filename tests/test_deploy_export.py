@@ -18,6 +18,7 @@ from wbm.deploy.config import DeployConfig
 from wbm.deploy.loop import run_loop
 from wbm.deploy.probe import Probe
 from wbm.deploy.runtime import PolicyRuntime
+from wbm.robot.model import load_robot
 from wbm.robot.schema import PolicySchema
 
 SCHEMA = PolicySchema(num_depth_points=64, num_lidar_points=32)
@@ -108,7 +109,7 @@ def export(world, path: Path, monkeypatch, evaluation: str = "evaluation") -> Dr
         else (lambda _: (folder / "policy.onnx").read_bytes())
     )
     monkeypatch.setattr("wbm.learning.export.export_onnx", model)  # eight seconds, once; its own tests repeat it
-    monkeypatch.setattr("wbm.scenes.assets.load_assets", lambda path: SimpleNamespace(texts=texts))
+    monkeypatch.setattr("wbm.scenes.assets.load_assets", lambda path: SimpleNamespace(texts=texts, robot=load_robot()))
     manifests = {
         s: SimpleNamespace(name="main", ref=f"{s}/main/0", content_digest="d", metrics={}) for s in deploy_export.INPUTS
     }

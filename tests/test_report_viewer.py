@@ -97,7 +97,7 @@ def test_steps_place_robot_and_objects(viewer):
     colours = np.asarray(viewer._parts["camera"].colors)
     assert (colours[:10] == (255, 70, 20)).all() and not (colours[10:] == (255, 70, 20)).all(axis=1).any()
     assert "contact" in viewer._clock.content
-    rot_w, pos_w = frame_poses(robot, to_target(tracks.q[40], tracks.action[40], ActionSpec()))["ee"]
+    rot_w, pos_w = frame_poses(robot, to_target(np, tracks.q[40], tracks.action[40], ActionSpec()))["ee"]
     np.testing.assert_allclose(viewer._parts["command"].position, pos_w, atol=1e-9)
     np.testing.assert_allclose(quat_to_mat(np, np.array(viewer._parts["command"].wxyz)), rot_w, atol=1e-9)
     viewer.show(10_000)

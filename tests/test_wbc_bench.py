@@ -5,7 +5,8 @@ import importlib.util
 import numpy as np
 import pytest
 
-from stages.bench import _arguments
+from stages.bench import _arguments, _known
+from stages.bench import bench as run_bench
 from stages.convert import ConfigError
 from wbm.control import bench
 from wbm.control.bench_mink import _Problem
@@ -63,7 +64,10 @@ def test_a_missing_peer_is_named(monkeypatch):
 
 
 def test_settings_become_arguments():
-    assert _arguments("wbc", bench.bench_wbc, ["steps=1000000", "peers=false"]) == {"steps": 1_000_000, "peers": False}
-    for setting, words in (("stpes=1", "did you mean 'steps'"), ("steps=many", "whole number"), ("peers=1", "true")):
+    known = _known(bench.bench_wbc)
+    assert _arguments("wbc", known, ["steps=1000000", "peers=false"]) == {"steps": 1_000_000, "peers": False}
+    for setting, words in (("steps=many", "whole number"), ("peers=1", "true")):
         with pytest.raises(ConfigError, match=words):
-            _arguments("wbc", bench.bench_wbc, [setting])
+            _arguments("wbc", known, [setting])
+    with pytest.raises(ConfigError, match="unknown key 'stpes'"):
+        run_bench("wbc", ["stpes=1"], as_json=True)

@@ -52,11 +52,9 @@ class SeenEnv(WholeBodyEnv):
         if self.guided:
             super()._plan(ids, scenes, start, goal)
 
-    def _begin(self, ids: Tensor) -> None:
-        first = self.next_episode
-        super()._begin(ids)
+    def _begin(self, ids: Tensor, episodes: np.ndarray) -> None:
+        super()._begin(ids, episodes)
         self._settled_goal[ids] = self._goal_pos[ids]
-        episodes = np.arange(first, first + len(ids))
         u = self._uniforms(episodes)[:, self._hint]
         self.belief.begin(ids, self.reader.start_pos[ids], u, self.cfg.seen.hint_error)
         if not self.guided:

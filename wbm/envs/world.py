@@ -68,7 +68,8 @@ def make_env(
         ValueError: no scene has a reachable pre-grasp.
     """
     bank = assets.scenes
-    template = SceneModelConfig(num_distractors=bank.num_distractors)
+    # MuJoCo Warp has one geometry type and one set of collision bits for all environments.
+    template = SceneModelConfig(bank.num_distractors, "mesh" if cfg.sim.engine == "mujoco_warp" else "native")
     model = scene_model or SceneModel(assets.objects, template, cfg.robot, assets.robot)
     tried = SceneBinding(model, bank, rows, device)
     starts, approach = find_starts(tried, cfg, seed, device, grasps)

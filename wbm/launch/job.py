@@ -38,14 +38,19 @@ class Job:
         stop = StopSignal(self.patience_s if rank == 0 else None)  # rank 0 speaks for all
         try:
             with stop:
-                getattr(importlib.import_module(module), function)(self.place, submission.task(self.task), stop)
+                try:
+                    getattr(importlib.import_module(module), function)(self.place, submission.task(self.task), stop)
+                except BrokenExecutor:
+                    time.sleep(1.0)  # Slurm signals every process: a worker may have heard what comes here next
+                    raise
         except Stopped as reason:
             print(f"stopped: {reason}", file=sys.stderr, flush=True)
         except BrokenExecutor as error:  # the kernel took a worker process, mostly for its memory
-            if not self._may_retry(rank):
-                raise
-            print(f"{error}; starting again", file=sys.stderr, flush=True)
-            stop.requeue = True
+            if not stop.requested:
+                if not self._may_retry(rank):
+                    raise
+                stop.requeue = True
+            print(f"{error}; {'stopping' if stop.requested else 'starting again'}", file=sys.stderr, flush=True)
         else:
             return
         if rank == 0 and stop.requeue and not (self.place / "cancelled").exists():

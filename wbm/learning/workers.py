@@ -49,11 +49,12 @@ def run_jobs(module: str, jobs: Sequence[Any], workers: int) -> Iterator[Any]:
 
 
 def _quiet() -> None:
-    """Ctrl-C goes to the parent alone, which ends its workers; a parent that was killed takes them along (Linux).
+    """Ctrl-C and Slurm's warning go to the parent alone, which ends its workers; killed, it takes them along (Linux).
 
     Else a worker would go on writing its shard while the next run writes the same one.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGUSR2, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         parent = multiprocessing.parent_process()

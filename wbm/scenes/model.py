@@ -27,6 +27,7 @@ Field = Callable[[str], Any]
 
 EVERYTHING = ROBOT_BIT | OBJECT_BIT | STATIC_BIT
 PARK_DEPTH = -3.0
+ASIDE = 30.0
 # The compiler shortens kinematics where a geom's frame is its body's or its inertia's: here none may coincide.
 _TILT = (0.9238795325112867, 0.3826834323650898, 0.0, 0.0)
 _LEAN = (0.9238795325112867, 0.0, 0.3826834323650898, 0.0)
@@ -143,7 +144,11 @@ class SceneModel:
             write(field("geom_friction"), ids, self._slots, per_slot, component=0)
         scale = np.ones((count, width)) if mass_scale is None else np.broadcast_to(columns(mass_scale), (count, width))
         self._load_masses(field, ids, chosen, scale)
-        poses = np.concatenate([bank.object_pos[scenes], bank.object_quat[scenes]], axis=2).reshape(count, -1)
+        pos = bank.object_pos[scenes]
+        if self.cfg.slots == "mesh":  # empty slots collide there too: below the floor it would throw them up
+            aside = np.stack([np.full(width, ASIDE), 2.0 * np.arange(width), np.ones(width)], axis=1)
+            pos = np.where((chosen < 0)[..., None], aside, pos)
+        poses = np.concatenate([pos, bank.object_quat[scenes]], axis=2).reshape(count, -1)
         write(qpos, ids, slice(0, self.object_qpos.stop), np.concatenate([bank.q_start[scenes], poses], axis=1))
 
     def _load_supports(self, field: Field, ids: np.ndarray, bank: SceneBank, scenes: np.ndarray) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
@@ -36,11 +38,12 @@ class MujocoWarpSimulation(Simulation):
         self.model, self.num_envs, self.device = model, num_envs, device
         self._device = wp.get_device(device)
         with wp.ScopedDevice(self._device):
-            self._m = mjw.put_model(model)
+            self._m = mjw.put_model(_without_midphase(model))
             self._d = mjw.make_data(model, nworld=num_envs, nconmax=CONTACTS, njmax=ROWS)
         self._fields: dict[str, torch.Tensor] = {}
         self._states: dict[str, torch.Tensor] = {}
         self._graph: wp.Graph | None = None
+        self._static = torch.as_tensor(np.flatnonzero(model.geom_bodyid == 0), device=device)
         self.qpos, self.qvel = self.state("qpos"), self.state("qvel")
         self.ctrl, self.sensordata = self.state("ctrl"), self.state("sensordata")
         self._run(mjw.forward)
@@ -99,7 +102,23 @@ class MujocoWarpSimulation(Simulation):
         self._run(lambda m, d: mjw.reset_data(m, d, chosen))
 
     def forward(self, ids: torch.Tensor) -> None:
+        self._place_static()
         self._for_some(ids, mjw.forward)
+
+    def _place_static(self) -> None:
+        """Move the world body's geoms to their environments' places, which MuJoCo Warp computes but once."""
+        pos, quat = self._fields.get("geom_pos"), self._fields.get("geom_quat")
+        if pos is None or quat is None:
+            return
+        wp.to_torch(self._d.geom_xpos)[:, self._static] = pos[:, self._static]
+        w, x, y, z = quat[:, self._static].unbind(-1)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        mats = torch.stack([torch.stack(row, -1) for row in rows], -2)
+        wp.to_torch(self._d.geom_xmat)[:, self._static] = mats
 
     def set_const(self, ids: torch.Tensor) -> None:
         kept = self.save_state()
@@ -130,3 +149,10 @@ class MujocoWarpSimulation(Simulation):
     def _run(self, function) -> None:
         with wp.ScopedDevice(self._device):
             function(self._m, self._d)
+
+
+def _without_midphase(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The same model without the flag that switches MuJoCo C's midphase off: there is none here to switch off."""
+    plain = copy.copy(model)
+    plain.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+    return plain

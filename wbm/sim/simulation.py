@@ -126,6 +126,11 @@ def make_simulation(model: mujoco.MjModel, num_envs: int, cfg: SimConfig, device
     return MujocoWarpSimulation(model, num_envs, device)
 
 
+def default_device(cfg: SimConfig) -> str:
+    """Where environments of this engine live: on the GPU if the engine can use one and there is one."""
+    return "cuda" if cfg.engine == "mujoco_warp" and torch.cuda.is_available() else "cpu"
+
+
 def env_ids(ids: torch.Tensor) -> np.ndarray:
     """Environment ids as the sorted unique int array that the engines take."""
     return np.unique(ids.detach().cpu().numpy().astype(np.int64))
