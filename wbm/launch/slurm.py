@@ -7,7 +7,9 @@ import shutil
 import subprocess
 import time
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +82,7 @@ def submit(submission: Submission, place: Path, cfg: LauncherConfig) -> dict[str
         needed = [ids[other] for other in tasks[0].after]
         executor.update_parameters(**_parameters(cfg, group, tasks[0].resources, needed, place))
         try:
-            with executor.batch():
+            with redirect_stderr(StringIO()), executor.batch():  # submitit repeats what sbatch says; the error holds it
                 jobs = [executor.submit(Job(place, t.name, _patience(cfg), cfg.retries)) for t in tasks]
         except (FailedJobError, FailedSubmissionError, subprocess.CalledProcessError) as error:
             _scancel(list(ids.values()))

@@ -37,7 +37,7 @@ class FrameDelay:
         self.out = {name: wp.zeros_like(array) for name, array in self._frame.items()}
         self._views = []
         for name, array in self._frame.items():
-            width = int(array.strides[0]) if n else 0
+            width = int(array.strides[0]) if n else 0  # pyright: ignore[reportArgumentType]
             dtype, size = (wp.uint32, 4) if width % 4 == 0 else (wp.uint8, 1)
             ring = wp.zeros((n, self._ring_size, width // size), dtype=dtype, device=device)
             out = self.out[name]

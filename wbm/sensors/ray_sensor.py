@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -81,7 +82,7 @@ class RaySensor:
         self._bundles = self._upload_table(part)
         self._allocate()
 
-    def _upload_table(self, part: int) -> Bundles:
+    def _upload_table(self, part: int) -> Any:  # a `Bundles`; a Warp struct is no class to a type checker
         table, device = self.table, self.scene.device
 
         def vectors(value: np.ndarray, dtype: type) -> wp.array:
@@ -136,10 +137,10 @@ class RaySensor:
         if not shared:
             return memory
         self._memory.append(memory)
-        strides = (0, *memory.strides[1:])
-        return wp.array(ptr=memory.ptr, dtype=dtype, shape=(n, *shape), strides=strides, device=device)
+        strides = (0, *memory.strides[1:])  # pyright: ignore[reportArgumentType, reportOptionalSubscript]
+        return wp.array(ptr=memory.ptr, dtype=dtype, shape=(n, *shape), strides=strides, device=device)  # pyright: ignore[reportArgumentType]
 
-    def _new_slots(self) -> Slots:
+    def _new_slots(self) -> Any:
         out, new, num = Slots(), self._temporary, (self.scene.num_instances,)
         out.count, out.inst, out.kind = new((), wp.int32), new(num, wp.int32), new(num, wp.int32)
         out.size, out.mesh, out.rot = new(num, wp.vec3), new(num, wp.uint64), new(num, wp.mat33)
@@ -147,7 +148,7 @@ class RaySensor:
         out.near = new(num, wp.float32)
         return out
 
-    def _new_work(self) -> Scratch:
+    def _new_work(self) -> Any:
         out, new, num = Scratch(), self._temporary, self.scene.num_instances
         groups, bundles = self.table.group_cone.shape[1], self.table.cone.shape[1]
         out.group_slot, out.slot = new((groups, num), wp.int16), new((bundles, num), wp.int16)
