@@ -109,7 +109,7 @@ def _compose_raw(overrides: Sequence[str]) -> DictConfig:
     for item in items:
         _check_override(item)
     # An entry of a mapping, such as inputs.assets=NAME, is new to Hydra, which would ask for a plus sign.
-    added = [_is_entry(item) and not (item.is_add() or item.is_delete()) for item in items]
+    added = [_is_entry(item) and not (item.is_add() or item.is_force_add() or item.is_delete()) for item in items]
     lines = [f"++{line}" if new else line for new, line in zip(added, overrides, strict=True)]
     try:
         return hydra_compose(CONFIG_NAME, overrides=lines, return_hydra_config=True)

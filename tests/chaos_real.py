@@ -150,8 +150,15 @@ def watch_units(log: Path) -> None:
     import multiprocessing
 
     from wbm.artifacts.store import Draft
-    from wbm.learning import distill, evaluation, rollouts, teacher
+    from wbm.learning import distill, evaluation, rollouts, teacher, workers
 
+    start_worker = workers._quiet
+
+    def quiet() -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # as in a fresh interpreter
+        start_worker()
+
+    workers._quiet = quiet
     fork_context = multiprocessing.get_context("fork")
     multiprocessing.get_context = lambda _=None: fork_context  # workers start from here, not from an empty interpreter
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)

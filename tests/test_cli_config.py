@@ -251,5 +251,5 @@ def test_worker_counts_and_notes_are_no_part_of_a_key():
 
 
 def test_an_entry_of_a_mapping_needs_no_plus_sign():
-    for line in ("inputs.assets=assets/mine", "+inputs.assets=assets/mine"):
+    for line in ("inputs.assets=assets/mine", "+inputs.assets=assets/mine", "++inputs.assets=assets/mine"):
         assert compose.compose([line]).config.inputs == {"assets": "assets/mine"}
