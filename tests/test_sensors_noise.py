@@ -199,11 +199,11 @@ def run_delay(config: DelayConfig, num: int, steps: int, seed: int = 0):
 
 
 def test_delay_distribution():
-    ages, _, _, _ = run_delay(DelayConfig(1, 4), 8000, 6)
+    ages, _, _, _ = run_delay(DelayConfig(1, 4), 40_000, 6)
     assert (ages[0] == 0).all()
     counts = np.bincount(ages[-1], minlength=5)
     assert counts[0] == 0
-    assert np.abs(counts[1:] / 2000 - 1).max() < 0.1
+    assert np.abs(counts[1:] / 10_000 - 1).max() < 0.05
     assert abs(ages[-1].mean() / 2.5 - 1) < 0.05
 
 
