@@ -17,7 +17,7 @@ from wbm.envs.config import EnvConfig
 from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.pregrasp import StartBank, solve_starts
 from wbm.learning.config import PpoConfig
-from wbm.learning.teacher import _observation, make_ppo
+from wbm.learning.teacher import as_observation, make_ppo
 from wbm.robot.model import load_robot
 from wbm.scenes.config import ObjectsConfig, ScenesConfig
 from wbm.scenes.generate import generate_scenes
@@ -101,13 +101,13 @@ def _iterate(env: GraspEnv, alg: Any, ppo: PpoConfig, watch: _Watch) -> None:
     with torch.no_grad():
         for _ in range(ppo.steps):
             with watch("policy"):
-                action = alg.act(_observation(env.obs))
+                action = alg.act(as_observation(env.obs))
             obs, reward, done, info = env.step(action)
             with watch("policy"):
-                alg.process_env_step(_observation(obs), reward, done, {"time_outs": info["time_outs"]})
+                alg.process_env_step(as_observation(obs), reward, done, {"time_outs": info["time_outs"]})
     with watch("update"):
         with torch.no_grad():
-            alg.compute_returns(_observation(env.obs))
+            alg.compute_returns(as_observation(env.obs))
         alg.update()
 
 

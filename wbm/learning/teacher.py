@@ -108,25 +108,25 @@ def train_teacher(
     for iteration in range(start, cfg.iterations):
         if best >= cfg.target or (cfg.patience and stale >= cfg.patience):
             break
-        left = 1 - iteration / cfg.iterations
-        alg.entropy_coef = ppo.entropy * left
+        remaining = 1 - iteration / cfg.iterations
+        alg.entropy_coef = ppo.entropy * remaining
         if ppo.schedule == "linear":
-            _set_learning_rate(alg, ppo.lr * (ppo.lr_final + (1 - ppo.lr_final) * left))
+            _set_learning_rate(alg, ppo.lr * (ppo.lr_final + (1 - ppo.lr_final) * remaining))
 
         # Collect
         rewards_sum, terms, outcomes = 0.0, torch.zeros(len(rewards.TERMS)), torch.zeros(len(REASONS))
         with torch.no_grad():
             for _ in range(ppo.steps):
-                action = alg.act(_observation(obs))
+                action = alg.act(as_observation(obs))
                 obs, reward, done, info = env.step(action)
                 _watch(env, iteration, scratch, reward=reward, obs=obs)
-                alg.process_env_step(_observation(obs), reward, done, {"time_outs": info["time_outs"]})
+                alg.process_env_step(as_observation(obs), reward, done, {"time_outs": info["time_outs"]})
                 rewards_sum += reward.mean().item()
                 terms += info["terms"].mean(0).cpu()
                 outcomes += torch.bincount(info["outcome"].long(), minlength=len(REASONS)).cpu()
                 curriculum.count(info["scene"][done], info["outcome"][done])
             curriculum.update(team.sum)
-            alg.compute_returns(_observation(obs))
+            alg.compute_returns(as_observation(obs))
 
         # Learn
         losses = alg.update()
@@ -191,7 +191,7 @@ def train_teacher(
 
 def make_ppo(env: GraspEnv, ppo: PpoConfig, team: Team | None = None) -> PPO:
     """rsl_rl's PPO with actor, critic and storage for `env`, or its counterpart for a team of several."""
-    obs = _observation(env.obs)
+    obs = as_observation(env.obs)
     groups = {"actor": ["teacher"], "critic": ["teacher"]}
     sizes = {"hidden_dims": list(ppo.hidden), "activation": ppo.activation}
     kind = "GaussianDistribution" if team is None or team.size == 1 else TeamGaussian
@@ -242,7 +242,8 @@ def _set_learning_rate(alg: PPO, rate: float) -> None:
         group["lr"] = rate
 
 
-def _observation(obs: torch.Tensor) -> TensorDict:
+def as_observation(obs: torch.Tensor) -> TensorDict:
+    """Observations [N,O] as rsl_rl takes them."""
     return TensorDict({"teacher": obs}, batch_size=[len(obs)])
 
 
