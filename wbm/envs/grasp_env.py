@@ -197,10 +197,6 @@ class GraspEnv:
             q[:, joints.NECK] = self._neck_home
         return q
 
-    def _contact_steps(self) -> Tensor:
-        """Policy steps [N] since the contact-rich phase began."""
-        return self.elapsed
-
     def _time_up(self) -> Tensor:
         """Episodes [N] whose time has run out."""
         return self.elapsed >= self.max_steps
@@ -292,10 +288,9 @@ class GraspEnv:
         self.controller.forward_kinematics()
         self.state = self.reader.read(self.frame_pos, self.frame_quat)
         self.known = s = self._known(self.state)
-        time = self._contact_steps() / self.max_steps
         offset = self.action.offset(s.q, s.ee_pos_w, s.ee_quat)
         self.obs = self.observe(
-            s, self.ctrl[:, joints.HAND], self.reader.support, self.min_distance, time, offset, self.previous
+            s, self.ctrl[:, joints.HAND], self.reader.support, self.min_distance, offset, self.previous
         )
 
     # The controller's live arrays as tensors

@@ -35,7 +35,6 @@ FIELDS: tuple[tuple[str, tuple[str, ...], float], ...] = (
     ("grasp frame above the support, m", ("ee_above_support",), 5.0),
     ("fingertips above the support, m", _each("tip_above_support", joints.FINGERS), 8.0),
     ("controller's nearest obstacle distance, m, at most 0.2", ("obstacle_distance",), 5.0),
-    ("share of the episode's time that has passed", ("time",), 1.0),
 )
 LABELS: tuple[str, ...] = tuple(label for _, labels, _ in FIELDS for label in labels)
 """Labels of the fixed part; the action term's target offset and the previous action follow."""
@@ -60,7 +59,6 @@ class TeacherObservation:
         hand_target: Tensor,
         support_height: Tensor,
         obstacle_distance: Tensor,
-        time: Tensor,
         offset: Tensor,
         previous: Tensor,
     ) -> Tensor:
@@ -71,7 +69,6 @@ class TeacherObservation:
             hand_target: commanded hand joints [N,16].
             support_height: world height [N] of the surface that the target settled on.
             obstacle_distance: the controller's smallest distance [N].
-            time: share of the episode [N].
             offset: the action term's target offset.
             previous: previous action.
         """
@@ -110,7 +107,6 @@ class TeacherObservation:
             (s.ee_pos_w[:, 2] - support_height).unsqueeze(1),
             s.tips_w[:, :, 2] - support_height.unsqueeze(1),
             obstacle_distance.clamp(max=0.2).unsqueeze(1),
-            time.unsqueeze(1),
             offset,
             previous,
         ]

@@ -10,7 +10,7 @@ from wbm.robot import joints
 
 
 class ScriptedGrasp:
-    """Maps a teacher's observation [N,O] to an action [N,A] of the `wbc` term with the `mix` hand.
+    """Maps a teacher's observation [N,O] and the time to an action [N,A] of the `wbc` term with the `mix` hand.
 
     Args:
         obs_labels, obs_scale: labels and scales of the observation (`TeacherObservation`).
@@ -39,13 +39,14 @@ class ScriptedGrasp:
         self.scale, self.cfg = obs_scale, cfg
         self.object = [index[f"obj_pos_e/{a}"] for a in "xyz"]
         self.up = [index[f"up_e/{a}"] for a in "xyz"]
-        self.time, self.above = index["time"], index["ee_above_support"]
+        self.above = index["ee_above_support"]
         self.phases, self.depth, self.lift = (reach, close), depth, lift
         self.size = 6 + 16 + 1 + len(joints.FINGERS)
 
-    def __call__(self, obs: Tensor) -> Tensor:
+    def __call__(self, obs: Tensor, time: Tensor) -> Tensor:
+        """Actions [N,A] for observations [N,O] at `time` [N], the share of the episode that has passed."""
         x = obs / self.scale
-        time, up = x[:, self.time], x[:, self.up]
+        up = x[:, self.up]
         action = torch.zeros(len(obs), self.size, device=obs.device)
         # Go to the object's centre, but not below the least height above the support.
         goal = x[:, self.object]

@@ -33,8 +33,8 @@ class TeacherConfig:
     split: str = "train"
     eval_split: str = "val"
     num_envs: int = 128
-    iterations: int = 240
-    eval_every: int = 80
+    iterations: int = 400
+    eval_every: int = 100
     eval_episodes: int = 128
     eval_envs: int = 64
     patience: int = 6
