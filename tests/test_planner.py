@@ -22,6 +22,7 @@ from wbm.envs.world import WorldConfig, find_starts
 from wbm.robot import joints
 from wbm.robot.config import MjcfOptions
 from wbm.robot.model import load_robot
+from wbm.scenes.bank import SceneBank
 from wbm.sim.config import SimConfig
 
 BOX = 6
@@ -32,7 +33,9 @@ def target(half=(0.05, 0.02, 0.1), yaw=0.3, heading=0.1, ceiling=np.inf) -> Targ
         return torch.tensor([x], dtype=torch.float32)
 
     quat = row(np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
-    return Target(row(1.0, 0.2, 0.8), quat, row(*half), row(heading)[0], row(0.8 - half[2])[0], row(ceiling)[0])
+    angle = np.arange(180) * np.pi / 180 - yaw
+    width = row(*(2 * half[0] * np.abs(np.cos(angle)) + 2 * half[1] * np.abs(np.sin(angle))))
+    return Target(row(1.0, 0.2, 0.8), quat, row(*half), width, row(heading)[0], row(0.8 - half[2])[0], row(ceiling)[0])
 
 
 def test_a_top_down_grasp_closes_across_the_narrow_side_and_points_away_from_the_base():
@@ -71,9 +74,24 @@ def test_the_preferred_grasp_is_taken_unless_the_other_has_far_more_room():
     assert choose_grasp(clearance, torch.tensor([0, 0, 0, 0, 1])).tolist() == [0, 1, 1, -1, 1]
 
 
+def fenced(bank: SceneBank) -> SceneBank:
+    """The same tables with a board before and behind every target, lower than a hand from above needs."""
+    arrays = {k: getattr(bank, k).copy() for k in ("support_pos", "support_size", "support_quat", "support_count")}
+    for row in range(len(bank)):
+        for side in (-1.0, 1.0):
+            k = int(arrays["support_count"][row])
+            target = bank.object_pos[row, 0]
+            arrays["support_pos"][row, k] = [target[0] + side * 0.17, target[1], bank.surface_z[row] + 0.06]
+            arrays["support_size"][row, k] = [0.01, 0.5, 0.06]
+            arrays["support_quat"][row, k] = [1.0, 0.0, 0.0, 0.0]
+            arrays["support_count"][row] = k + 1
+    return replace(bank, **arrays)
+
+
 def test_a_hint_that_cannot_be_followed_gives_way_to_another_grasp():
     model, bank = scenes()
-    bank = replace(bank, approach=np.full(len(bank), GRASPS.index("side")))  # no room beside these low objects
+    bank = fenced(bank)
+    bank = replace(bank, approach=np.full(len(bank), GRASPS.index("side")))
     cfg = WorldConfig(MjcfOptions(), SimConfig(), WbcConfig(), replace(EnvConfig(), starts_per_scene=1))
     binding = SceneBinding(model, bank, bank.where("train")[:2])
     with pytest.raises(ValueError, match="no scene has a reachable pre-grasp"):

@@ -21,11 +21,17 @@ HAND_ROOM = 0.20
 SIDE_HEIGHT = 0.06
 """A target must rise this far (m) above its support for fingers beside it to clear the surface."""
 
+SIDE_ROOM = 0.10
+"""Height (m) of a side grasp frame above the support at which the hand keeps the controller's distance from it."""
+
 SWING = 1.2
 """Range (rad) of the headings from which a side grasp comes."""
 
 AMPLE = 0.05
 """Clearance (m) beyond which more room is worth nothing."""
+
+COMFORT = 0.01
+"""What closing a top-down grasp across the heading costs against closing along it, m of the object's width."""
 
 PREFERENCE = 0.75
 """How much of the ample clearance the scene's preferred grasp may lack and still be taken."""
@@ -37,6 +43,7 @@ class Target:
 
     Attributes:
         pos: centre of the bounding box [B,3], m; quat: its orientation [B,4] (w x y z); half: half extents [B,3], m.
+        width: horizontal extent [B,A] along A world directions, evenly from 0 to pi, m.
         heading: yaw of the robot's base where it will stand [B], rad.
         support, ceiling: heights of the surface below and of what is above [B], m; inf where nothing is.
     """
@@ -44,6 +51,7 @@ class Target:
     pos: Tensor
     quat: Tensor
     half: Tensor
+    width: Tensor
     heading: Tensor
     support: Tensor
     ceiling: Tensor
@@ -62,9 +70,10 @@ class Target:
 def pregrasp_poses(target: Target, grasp: str, standoff: float, swing: Tensor) -> tuple[Tensor, Tensor]:
     """Positions [B,3] and orientations [B,4] of the grasp frame before the target.
 
-    `top_down`: z down above the target, x along the shorter horizontal axis of its box (of the two directions the one
-    that points away from the base, which is in the wrist's reach). `side`: z level at the heading plus `swing` (x
-    level too), so that the fingers wrap around an upright object.
+    `top_down`: z down above the target, x where the target is narrow as seen from above, along the heading where it is
+    round (of the two directions the one that points away from the base, which is in the wrist's reach). `side`: z level
+    at the heading plus `swing` (x level too), so that the fingers wrap around an upright object; at the height of its
+    middle or, where the hand would have no room below, as low as it has.
 
     Args:
         target: B targets.
@@ -74,9 +83,10 @@ def pregrasp_poses(target: Target, grasp: str, standoff: float, swing: Tensor) -
     """
     extent = target.extent
     if grasp == "top_down":
-        shape = (target.mat * target.half.unsqueeze(1))[:, :2]  # box axes scaled, seen from above [B,2,3]
-        spread = shape @ shape.transpose(1, 2)
-        yaw = 0.5 * torch.atan2(2 * spread[:, 0, 1], spread[:, 0, 0] - spread[:, 1, 1]) + math.pi / 2
+        count = target.width.shape[1]
+        angle = torch.arange(count, device=target.width.device) * (math.pi / count)
+        cost = target.width + COMFORT * torch.sin(angle - target.heading.unsqueeze(1)) ** 2
+        yaw = angle[cost.argmin(1)]
         yaw = torch.where(torch.cos(yaw - target.heading) < 0, yaw + math.pi, yaw)
         c, s, zero = torch.cos(yaw / 2), torch.sin(yaw / 2), torch.zeros_like(yaw)
         pos = target.pos + torch.stack([zero, zero, extent[:, 2] + standoff], -1)
@@ -86,7 +96,9 @@ def pregrasp_poses(target: Target, grasp: str, standoff: float, swing: Tensor) -
     radius = (extent[:, :2].amax(1) + standoff).unsqueeze(1)
     ahead = torch.stack([torch.cos(yaw), torch.sin(yaw), torch.zeros_like(yaw)], -1)
     # The unturned frame has x to the left, y up and z ahead: (1 + i + j + k) / 2.
-    return target.pos - radius * ahead, 0.5 * torch.stack([c - s, c - s, c + s, c + s], -1)
+    pos = target.pos - radius * ahead
+    pos[:, 2] = torch.maximum(pos[:, 2], target.support + SIDE_ROOM)
+    return pos, 0.5 * torch.stack([c - s, c - s, c + s, c + s], -1)
 
 
 def fits(target: Target, grasp: str, standoff: float) -> Tensor:

@@ -8,9 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wbm.scenes.bank import SceneBank, obstacle_boxes
+from wbm.scenes.bank import SceneBank, obstacle_boxes, rotate
 from wbm.scenes.model import SceneModel
 from wbm.sim.simulation import Simulation
+
+
+NUM_DIRECTIONS = 180
 
 
 @dataclass
@@ -21,9 +24,11 @@ class SceneTable:
         target_pos: settled position of the target's frame [S,3], m: the centre of its bounding box.
         target_quat: settled orientation [S,4].
         box_half: half extents of the bounding box in the target's frame [S,3], m.
+        width: horizontal extent of the settled target along `NUM_DIRECTIONS` directions from 0 to pi [S,A], m.
         support_height: height of the surface that the target settled on [S], m.
         ceiling_height: height of what is above it [S], m; inf where nothing is.
-        base: base x, y, yaw from which the target is in reach [S,3].
+        base: base x, y, yaw from which the target is in reach [S,3]: on the straight line from the start pose, facing
+            the target, so that a policy which sees the target knows where to stand.
         q_start: collision-free joint positions away from the support [S,32].
         obstacle_type, obstacle_size, obstacle_pos, obstacle_quat: the controller's obstacles [S,M,...]; the
         target's own
@@ -33,6 +38,7 @@ class SceneTable:
     target_pos: Tensor
     target_quat: Tensor
     box_half: Tensor
+    width: Tensor
     support_height: Tensor
     ceiling_height: Tensor
     base: Tensor
@@ -99,12 +105,29 @@ class SceneBinding:
             target_pos=tensor(bank.object_pos[rows, 0]),
             target_quat=tensor(bank.object_quat[rows, 0]),
             box_half=tensor(objects.half_extent[bank.object[rows, 0]]),
+            width=tensor(_widths(objects.points[bank.object[rows, 0]], bank.object_quat[rows, 0])),
             support_height=tensor(bank.surface_z[rows]),
             ceiling_height=tensor(bank.ceiling_z[rows]),
-            base=tensor(bank.base_grasp[rows]),
+            base=tensor(_stand(bank, rows)),
             q_start=tensor(bank.q_start[rows]),
             obstacle_type=torch.as_tensor(boxes.type, dtype=torch.int32, device=device),
             obstacle_size=tensor(boxes.size),
             obstacle_pos=tensor(pos),
             obstacle_quat=tensor(quat),
         )
+
+
+def _widths(points: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Extents [S,A] of surface points [S,P,3] in orientations [S,4] along horizontal directions."""
+    angle = np.arange(NUM_DIRECTIONS) * (np.pi / NUM_DIRECTIONS)
+    along = rotate(quat[:, None], points)[..., :2] @ np.stack([np.cos(angle), np.sin(angle)])
+    return np.ptp(along, axis=1)
+
+
+def _stand(bank: SceneBank, rows: np.ndarray) -> np.ndarray:
+    """Base poses [S,3] as far from the targets as the bank's own, on the lines from the start poses."""
+    target = bank.object_pos[rows, 0, :2]
+    reach = np.linalg.norm(target - bank.base_grasp[rows, :2], axis=1, keepdims=True)
+    away = target - bank.q_start[rows, :2]
+    ahead = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    return np.concatenate([target - reach * ahead, np.arctan2(ahead[:, 1:], ahead[:, :1])], axis=1)

@@ -192,7 +192,10 @@ class GraspEnv:
 
     def _start_joints(self, ids: Tensor, scenes: Tensor, u: Tensor) -> Tensor:
         """Joint positions [K,32] in which the episodes of environments `ids` start."""
-        q = self.starts.draw(scenes, u[:, self._start].squeeze(1))
+        return self._fixed_neck(self.starts.draw(scenes, u[:, self._start].squeeze(1)))
+
+    def _fixed_neck(self, q: Tensor) -> Tensor:
+        """Joint positions [K,32] with the neck at its home pose where there is no active vision."""
         if self.cfg.action.neck == "fixed":
             q[:, joints.NECK] = self._neck_home
         return q

@@ -22,9 +22,16 @@ from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
 
+ROOMY = 0.015
+"""Clearance (m) with which the planner's own pre-grasp is taken before those with more."""
+
+
 @dataclass
 class StartBank:
     """Joint positions at pre-grasps: `q` [S,K,32]; scene s has `count[s]` of them, first in its row.
+
+    The first of a scene is the planner's own: straight ahead and in the middle, so that it follows from what can be
+    seen, or, where that is out of reach or short of room, the one with the most room. The others are spread around it.
 
     `clearance` [S] is the largest distance from everything among a scene's starts, m, -inf without one.
     A scene without a reachable pre-grasp has a count of 0; `draw` must not be asked for it.
@@ -39,6 +46,10 @@ class StartBank:
         pick = (uniform * self.count[scenes]).long()
         return self.q[scenes, pick].clone()
 
+    def first(self, scenes: Tensor) -> Tensor:
+        """The planner's own choice [K,32] for each of `scenes` [K]."""
+        return self.q[scenes, 0].clone()
+
     @property
     def usable(self) -> Tensor:
         """Indices of the scenes that have a start."""
@@ -48,17 +59,20 @@ class StartBank:
 def target_of(table: SceneTable, scenes: Tensor) -> Target:
     """The targets of `scenes` [B] as the planner sees them."""
     t = table
-    rows = (t.target_pos, t.target_quat, t.box_half, t.base[:, 2], t.support_height, t.ceiling_height)
+    rows = (t.target_pos, t.target_quat, t.box_half, t.width, t.base[:, 2], t.support_height, t.ceiling_height)
     return Target(*(values[scenes] for values in rows))
 
 
-def grasp_poses(table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Pre-grasp positions [B,3] and orientations [B,4] of the grasp frame, jittered by `u` [B,7]."""
+def grasp_poses(
+    table: SceneTable, scenes: Tensor, grasp: str, cfg: EnvConfig, u: Tensor, spread: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pre-grasp positions [B,3] and orientations [B,4] of the grasp frame, jittered by `u` [B,7] times `spread` [B]."""
     r = cfg.randomization
-    pos, quat = pregrasp_poses(target_of(table, scenes), grasp, cfg.standoff, u[:, 0])
+    pos, quat = pregrasp_poses(target_of(table, scenes), grasp, cfg.standoff, 0.5 + spread * (u[:, 0] - 0.5))
     turn = torch.stack([scaled(r.start_tilt, u[:, 1]), scaled(r.start_tilt, u[:, 2]), scaled(r.start_yaw, u[:, 3])], -1)
     shift = torch.stack([scaled(r.start_offset, u[:, k]) for k in (4, 5, 6)], -1)
-    return pos + rotate(quat, shift), quat_mul(quat, quat_exp(turn))
+    spread = spread.unsqueeze(1)
+    return pos + rotate(quat, spread * shift), quat_mul(quat, quat_exp(spread * turn))
 
 
 def solve_starts(
@@ -75,7 +89,8 @@ def solve_starts(
 ) -> StartBank:
     """Find `cfg.starts_per_scene` pre-grasps for each scene by running the controller itself, kinematically.
 
-    Candidates stand on random sides of the target; those that reach the pose clear of every obstacle are kept.
+    A scene's first candidate is the planner's own, the others are spread around it at random; those that reach the pose
+    clear of every obstacle are kept.
 
     Args:
         batch: candidates solved together.
@@ -88,7 +103,8 @@ def solve_starts(
     count, keep = table.count, cfg.starts_per_scene
     bank = torch.zeros(count, keep, joints.NUM_JOINTS, device=device)
     found = torch.zeros(count, dtype=torch.int64, device=device)
-    room = torch.full((count,), -torch.inf, device=device)
+    room = torch.full((count, keep), -torch.inf, device=device)
+    own = torch.zeros(count, keep, device=device)
     batch = min(batch, count * keep)
     solver = _Solver(table, robot, wbc_cfg, batch, device)
     columns, tried = Columns(), 0
@@ -99,19 +115,25 @@ def solve_starts(
         for first in range(0, len(lacking), batch):
             part = lacking[first : first + batch]
             u = torch.from_numpy(episode_uniforms(seed, np.arange(tried, tried + len(part)), columns.count)).to(device)
+            first_choice = torch.arange(tried, tried + len(part), device=device) < count
             tried += len(part)
-            pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter])
-            q, good, clear = solver.solve(part, pos, quat, stand_poses(table.base[part], u[:, stand]), iterations)
-            room.scatter_reduce_(0, part[good], clear[good], "amax")
-            for scene, row in zip(part[good].tolist(), q[good], strict=True):
-                if found[scene] < keep:
-                    bank[scene, found[scene]] = row
+            pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter], (~first_choice).float())
+            base = stand_poses(table.base[part], torch.where(first_choice.unsqueeze(1), 0.5, u[:, stand]))
+            q, good, clear = solver.solve(part, pos, quat, base, iterations)
+            for scene, i in zip(part[good].tolist(), good.nonzero().squeeze(1).tolist(), strict=True):
+                k = int(found[scene])
+                if k < keep:
+                    bank[scene, k], room[scene, k], own[scene, k] = q[i], clear[i], float(first_choice[i])
                     found[scene] += 1
     if int(found.max()) == 0:
         raise ValueError(
             f"no scene has a reachable {grasp} pre-grasp; check the scenes' support heights and env.standoff"
         )
-    return StartBank(bank, found, room)
+    best = (room + own * (room > ROOMY)).argmax(1)
+    scenes, first = torch.arange(count, device=device), bank[:, 0].clone()
+    bank[:, 0] = bank[scenes, best]
+    bank[scenes[best > 0], best[best > 0]] = first[best > 0]
+    return StartBank(bank, found, room.amax(1))
 
 
 def stand_poses(base: Tensor, u: Tensor) -> Tensor:

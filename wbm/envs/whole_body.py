@@ -15,11 +15,12 @@ from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
 from wbm.robot import joints
 
 FREE, CONTACT = 0, 1
-NEAR_WAYPOINT = (0.05, 0.3)  # m and rad at which the waypoint counts as passed
-NEAR_PREGRASP = (0.008, 0.06)  # the same at which the pre-grasp counts as reached, with the joints nearly at rest
+ASIDE = (2.0, 0.2)  # metres to stay back along the approach direction per metre and radian off its line
+LINE = (0.01, 0.05)  # m and rad that count as on it
+NEAR_PREGRASP = (0.012, 0.08)  # m and rad at which the pre-grasp counts as reached, with the joints nearly at rest
 GOOD_PREGRASP = (0.02, 0.15)  # and after `LINGER` s of trying, in whatever motion
-LINGER = 1.6
-CALM = (0.04, 0.10)  # m/s of the base and rad/s of arm joints that count as rest
+LINGER = 0.8
+CALM = (0.05, 0.15)  # m/s of the base and rad/s of arm joints that count as rest
 MAX_CORNERS = 12
 NEAR_CORNER = 0.15  # m at which a corner of the base's way counts as passed
 CARROT = 1.0  # m ahead of the base at which its target moves along the way
@@ -32,11 +33,14 @@ class WholeBodyEnv(GraspEnv):
     """`GraspEnv` whose episodes start far away: the controller brings the hand to a pre-grasp, then the policy
     takes over.
 
-    In free space the end-effector target moves at a bounded speed over a waypoint behind the pre-grasp, both fixed
-    in the world (a target that followed the base would make the controller chase itself), and the posture is the
-    pre-grasp's, base included. Where obstacles block the straight way of the base, the base first follows the
-    planner's corners with the arm held as it is. A teacher's action counts from the moment the pre-grasp is reached.
-    `step_targets` moves through both phases alike.
+    In free space the end-effector target moves at a bounded speed to the planner's own pre-grasp, which is fixed in the
+    world (a target that followed the base would make the controller chase itself); while the hand is off the line along
+    which it will approach, the target stays back on that line. The posture is the pre-grasp's, base included. Where the
+    hand goes next so follows from where it is and what it sees, with nothing that a student could not know.
+
+    Where obstacles block the straight way of the base, the base first follows the planner's corners with the arm held
+    as it is. A teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves through both
+    phases alike.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -44,7 +48,6 @@ class WholeBodyEnv(GraspEnv):
         super().__init__(*args, **kwargs)
         n, device = self.num_envs, self.device
         self._near = self.columns.add("near")
-        self._stage = torch.zeros(n, dtype=torch.int64, device=device)
         self._contact_since, self._close_since = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(2))
         self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
         self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
@@ -65,11 +68,12 @@ class WholeBodyEnv(GraspEnv):
         return self.max_steps + round(self.cfg.approach_s / self.period)
 
     def _start_joints(self, ids: Tensor, scenes: Tensor, u: Tensor) -> Tensor:
-        goal = super()._start_joints(ids, scenes, u)
         near = u[:, self._near].squeeze(1) < self.cfg.pregrasp_share
+        own = self._fixed_neck(self.starts.first(scenes))
+        goal = torch.where(near.unsqueeze(1), super()._start_joints(ids, scenes, u), own)
         self._goal_q[ids], self.started_near[ids] = goal, near
         self.phase[ids] = torch.where(near, CONTACT, FREE).to(torch.uint8)
-        self._stage[ids], self._contact_since[ids], self._close_since[ids] = 0, 0, 0
+        self._contact_since[ids], self._close_since[ids] = 0, -1
         away = self.binding.table.q_start[scenes].to(goal)
         away[:, joints.HAND] = goal[:, joints.HAND]
         start = torch.where(near.unsqueeze(1), goal, away)
@@ -127,23 +131,29 @@ class WholeBodyEnv(GraspEnv):
         return (pos - s.ee_pos_w).norm(dim=-1), turn.norm(dim=-1)
 
     def _waypoint(self) -> Tensor:
-        back = torch.tensor([0.0, 0.0, -self.cfg.approach_back], device=self.device).expand(self.num_envs, 3)
-        return self._goal_pos + rotate(self._goal_quat, back)
+        """Where the hand's target goes next [N,3]: to the pre-grasp, behind it while it is off the line of approach.
+
+        The target itself tells how far off: the hand that follows it late would feed its lag back.
+        """
+        ahead = rotate(self._goal_quat, torch.tensor([0.0, 0.0, 1.0], device=self.device).expand(self.num_envs, 3))
+        off = self.action.pos - self._goal_pos
+        aside = (off - (off * ahead).sum(-1, keepdim=True) * ahead).norm(dim=-1)
+        angle = quat_log(quat_mul(quat_conj(self.action.quat), self._goal_quat)).norm(dim=-1)
+        back = ASIDE[0] * (aside - LINE[0]).clamp(min=0.0) + ASIDE[1] * (angle - LINE[1]).clamp(min=0.0)
+        return self._goal_pos - back.clamp(max=self.cfg.approach_back).unsqueeze(1) * ahead
 
     def _arrive(self) -> None:
-        """Move on to the next stage, or to the contact-rich phase, where the hand has arrived."""
-        free = self.phase == FREE
-        distance, angle = self._errors(self._waypoint(), self._goal_quat)
-        passed = free & (self._stage == 0) & (distance < NEAR_WAYPOINT[0]) & (angle < NEAR_WAYPOINT[1])
-        self._stage[passed] = 1
-        self._close_since[passed] = self.elapsed[passed]
-        s = self.state
+        """Move on to the contact-rich phase where the hand has arrived."""
+        free, s = self.phase == FREE, self.state
         distance, angle = self._errors(self._goal_pos, self._goal_quat)
+        good = (distance < GOOD_PREGRASP[0]) & (angle < GOOD_PREGRASP[1])
+        self._close_since.copy_(
+            torch.where(good, torch.where(self._close_since < 0, self.elapsed, self._close_since), -1)
+        )
         calm = (s.qd[:, :2].norm(dim=-1) < CALM[0]) & (s.qd[:, joints.ARM].abs().amax(1) < CALM[1])
         settled = calm & (distance < NEAR_PREGRASP[0]) & (angle < NEAR_PREGRASP[1])
-        late = (self.elapsed - self._close_since) * self.period > LINGER
-        settled |= late & (distance < GOOD_PREGRASP[0]) & (angle < GOOD_PREGRASP[1])
-        ids = (free & (self._stage == 1) & settled).nonzero().squeeze(1)
+        settled |= good & ((self.elapsed - self._close_since) * self.period > LINGER)
+        ids = (free & settled).nonzero().squeeze(1)
         if len(ids):
             self.phase[ids], self._contact_since[ids] = CONTACT, self.elapsed[ids]
             self.posture[ids] = s.q[ids][:, self._body].to(self.posture)
@@ -152,8 +162,7 @@ class WholeBodyEnv(GraspEnv):
     def _approach(self, free: Tensor) -> None:
         """Lead the targets of the environments in free space towards waypoint and pre-grasp."""
         c, s, term = self.cfg, self.state, self.action
-        goal = torch.where((self._stage == 0).unsqueeze(1), self._waypoint(), self._goal_pos)
-        ahead = _towards(term.pos, goal, c.approach_speed * self.period)
+        ahead = _towards(term.pos, self._waypoint(), c.approach_speed * self.period)
         ahead = s.ee_pos_w + _towards(torch.zeros_like(ahead), ahead - s.ee_pos_w, c.approach_leash)
         turn = quat_log(quat_mul(quat_conj(term.quat), self._goal_quat))
         turned = quat_mul(term.quat, quat_exp(_towards(torch.zeros_like(turn), turn, c.approach_turn * self.period)))
