@@ -68,7 +68,7 @@ class WbcGains:
     safe_obstacle: float = 0.02
     safe_self: float = 0.02
     gamma: float = 0.25
-    brake: float = 1.5
+    brake: float = 1.2
     escape: float = 0.2
     ee_damping: float = 0.1
     repulsion: float = 0.0005
@@ -103,10 +103,10 @@ class WbcConfig:
     integrate: str = "target"
     lead_time: float = 0.4
     lag: float = 0.1
-    reach: float = 0.25
-    reach_self: float = 0.12
+    reach: float = 0.2
+    reach_self: float = 0.08
     slack_weight: float = 1.0e5
-    iterations: int = 40
+    iterations: int = 120
     distance_floor: float = 0.01
     weights: WbcWeights = field(default_factory=WbcWeights)
     gains: WbcGains = field(default_factory=WbcGains)
