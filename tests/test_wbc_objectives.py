@@ -4,12 +4,15 @@ Tolerances: central differences of float64 kinematics with 1e-5 rad leave 1e-9; 
 20 links, levers up to 2 m.
 """
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from wbm.control.config import WbcConfig
-from wbm.control.wbc import WholeBodyController
+from wbm.control.wbc import YAW_LEVER, WholeBodyController
+from wbm.kernels.wbc_objectives import CENTRING_BAND
 from wbm.robot.joints import WBC
 from wbm.robot.mjcf import robot_spec
 from wbm.robot.model import load_robot
@@ -95,6 +98,46 @@ def test_the_rows_of_gaze_and_viewing_distance(posed):
         distance = differences(model, data, q[e], lambda d: [np.linalg.norm(sight(d))])[0]
         assert np.abs(c._jac.numpy()[e, ROW_DISTANCE] - distance).max() < TOLERANCE
     assert checked > N // 2
+
+
+def test_the_diagonal_terms_descend_their_potentials():
+    """Posture, centring, damping and smoothness against central differences of what they minimise, in float64.
+
+    With `f(qd) = sum_i h_i qd_i^2 - 2 g_i qd_i` g is minus the slope of the potentials.
+    """
+    weights = replace(WbcConfig().weights, posture=0.3, posture_base=0.2, centring=0.4, smoothness=0.1)
+    cfg = WbcConfig(weights=weights)
+    robot = load_robot()
+    c = WholeBodyController(robot, N, 0, cfg)
+    q = sample_configurations(robot, N, seed=9)
+    low, high = robot.q_min[WBC], robot.q_max[WBC]
+    q[:, WBC[3:]] = np.linspace(low[3:], high[3:], N)  # from limit to limit, so that the outer bands are met
+    q[:, :3] = np.random.default_rng(9).uniform(-1.0, 1.0, (N, 3))
+    goal = (q[:, WBC] + np.random.default_rng(8).uniform(-0.2, 0.2, (N, len(WBC)))).astype(np.float32)
+    c.q.assign(q.astype(np.float32))
+    c.q_posture.assign(goal)
+    c.gaze_weight.fill_(0.0)  # its posture and its turn of the base have tests of their own
+    c.reset()
+    c.step()
+    joints, w, k = q[:, WBC].astype(np.float32).astype(np.float64), cfg.weights, cfg.gains
+    is_base = np.arange(len(WBC)) < 3
+    posture = np.where(is_base, w.posture_base, w.posture)
+    band = CENTRING_BAND * (high - low)
+
+    def inward(x):
+        return np.clip((low + band - x) / band, 0, 1) - np.clip((x - high + band) / band, 0, 1)
+
+    def potential(x):
+        centring = w.centring * k.centring * band * np.abs(inward(x)) ** 3 / 3
+        return 0.5 * posture * k.posture * (x - goal) ** 2 + np.where(is_base, 0.0, centring)
+
+    slope = (potential(joints + STEP) - potential(joints - STEP)) / (2 * STEP)
+    assert np.abs(inward(joints)[:, 3:]).max() > 0.99 and np.abs(slope).max() > 0.05
+    np.testing.assert_allclose(c._rhs.numpy(), -slope, atol=2e-5)
+    lever = np.where(is_base, np.array([1.0, 1.0, YAW_LEVER] + [0.0] * (len(WBC) - 3)), 0.0)
+    expected = w.damping + posture + lever**2 * (w.smoothness + w.base)
+    expected = expected + np.where(is_base, 0.0, w.centring * np.abs(inward(joints)))
+    np.testing.assert_allclose(c._diag.numpy(), expected, rtol=2e-5)
 
 
 def test_a_robot_that_starts_inside_an_obstacle_leaves_it():

@@ -12,7 +12,6 @@ from wbm.scenes.bank import SceneBank, obstacle_boxes, rotate
 from wbm.scenes.model import SceneModel
 from wbm.sim.simulation import Simulation
 
-
 NUM_DIRECTIONS = 180
 
 

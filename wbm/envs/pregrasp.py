@@ -21,7 +21,6 @@ from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
-
 ROOMY = 0.015
 """Clearance (m) with which the planner's own pre-grasp is taken before those with more."""
 
