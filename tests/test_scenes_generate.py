@@ -8,8 +8,9 @@ import pytest
 from scenes_small import SCENES, small_bank, small_model, small_objects
 
 from wbm.robot import joints, spheres
+from wbm.robot.rotations import rotate
 from wbm.scenes import generate
-from wbm.scenes.bank import SIDE, SceneBank, rotate
+from wbm.scenes.bank import SIDE, SceneBank
 from wbm.scenes.config import KINDS, ScenesConfig
 from wbm.scenes.layout import draw_layout
 from wbm.scenes.placement import draw_scene, self_clearance

@@ -14,9 +14,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.mjcf import OBJECT_BIT, STATIC_BIT, MjcfOptions, add_contact_sensors, build_robot
 from wbm.robot.model import RobotModel, load_robot
+from wbm.robot.rotations import quat_to_mat
 from wbm.scenes.bank import NUM_SUPPORTS, SceneBank
 from wbm.scenes.fields import body_tables, columns, write
 from wbm.scenes.objects import ObjectSet
