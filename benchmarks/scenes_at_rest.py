@@ -27,11 +27,13 @@ from wbm.sim.simulation import apply_options
 LIMIT = 0.005
 
 
-def at_rest(scenes: SceneModel, bank: SceneBank, cfg: SimConfig, seconds: float) -> list[dict[str, Any]]:
-    """One row a kind: what moved, fell or was touched in `seconds` with the robot held at its start."""
+def at_rest(
+    scenes: SceneModel, bank: SceneBank, cfg: SimConfig, seconds: float, threads: int = 0
+) -> list[dict[str, Any]]:
+    """One row a kind: what moved, fell or was touched in `seconds` with the robot held at its start; 0 threads: all."""
     apply_options(scenes.model, cfg)
     count = len(bank)
-    batch = mjbatch.Batch(scenes.model, count, 0)
+    batch = mjbatch.Batch(scenes.model, count, threads)
     fields = {name: batch.expand(name) for name in scenes.fields}
     qpos = batch.bind("qpos")
     scenes.load_scene(fields.__getitem__, qpos, np.arange(count), bank, np.arange(count))

@@ -28,9 +28,9 @@ from wbm.control.course import (
 )
 from wbm.control.gaze_trial import place_facing, settle
 from wbm.control.wbc import WholeBodyController
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.joints import WBC
 from wbm.robot.model import load_robot
+from wbm.robot.rotations import quat_to_mat
 
 OUT = Path("docs/images")
 SOLVERS = ("qp", "paper")

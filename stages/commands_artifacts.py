@@ -14,7 +14,7 @@ from stages.compose import to_yaml
 from stages.convert import ConfigError
 from stages.progress import Progress
 from stages.tables import metrics_text, seconds, size, table
-from wbm.artifacts import lineage
+from wbm.artifacts import collector, lineage
 from wbm.artifacts.compare import first_difference
 from wbm.artifacts.manifest import Manifest
 from wbm.artifacts.reference import WORD, is_reference, publish_reference
@@ -235,9 +235,9 @@ def verify(items: Sequence[str], as_json: bool) -> None:
 def gc(items: Sequence[str], delete: bool, grace_h: float, as_json: bool) -> None:
     """List, or delete, what nothing reaches."""
     store, _ = split(items, 0)
-    found = lineage.garbage(store, grace_h * 3600.0)
+    found = collector.garbage(store, grace_h * 3600.0)
     if delete:
-        lineage.collect(store, found, grace_h * 3600.0)
+        collector.collect(store, found, grace_h * 3600.0)
     if as_json:
         emit(
             {

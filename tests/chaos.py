@@ -1,6 +1,6 @@
-"""Kills runs of a pipeline at random moments and looks at what is left.
+"""Kills runs of the toy pipeline at random moments and looks at what is left: `python tests/chaos.py --kills 1000`.
 
-`python tests/chaos.py --kills 1000` uses the toy stages; with `--real`, `wbm run profile=smoke` itself (hours).
+The command line with all its start-up is what is killed; `chaos_real.py` does it to the real stages.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ class Damage:
     problems: list[str] = field(default_factory=list)
 
 
-def command(module: str, *arguments: str) -> list[str]:
-    return [sys.executable, "-m", module, *arguments]
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "toy", *arguments]
 
 
 SLOW = {**ENV, "TOY_SLEEP": "0.05"}
 
 
-def digests(module: str, *arguments: str) -> dict[str, str]:
+def digests(*arguments: str) -> dict[str, str]:
     """Content digests after an undisturbed run."""
-    done = subprocess.run(command(module, "run", "--json", *arguments), env=SLOW, capture_output=True, text=True)
+    done = subprocess.run(command("run", "--json", *arguments), env=SLOW, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return {s["artifact"]: s["content_digest"] for s in json.loads(done.stdout)["stages"]}
 
 
-def storm(folder: Path, kills: int, module: str = "toy", shards: int = 8, seed: int = 0) -> Damage:
+def storm(folder: Path, kills: int, shards: int = 8, seed: int = 0) -> Damage:
     """Run pipelines under one seed after another, killing with SIGKILL at random moments, until `kills` are spent."""
     rng, damage, number = random.Random(seed), Damage(), 0
     while damage.kills < kills:
         number += 1
         began = time.monotonic()
-        calm = digests(module, f"seed={number}", f"artifacts.root={folder / 'calm'}")
+        calm = digests(f"seed={number}", f"artifacts.root={folder / 'calm'}")
         undisturbed = time.monotonic() - began
         log = folder / f"log-{number}"
         arguments = [f"seed={number}", f"artifacts.root={folder / 'storm'}"]
         finished = False
         while not finished and damage.kills < kills:
             process = subprocess.Popen(
-                command(module, "run", *arguments),
+                command("run", *arguments),
                 env={**SLOW, "TOY_LOG": str(log)},
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
@@ -75,11 +75,11 @@ def storm(folder: Path, kills: int, module: str = "toy", shards: int = 8, seed: 
                 process.communicate()
                 damage.kills += 1
             found = subprocess.run(
-                command(module, "artifacts", "verify", arguments[1]), env=ENV, capture_output=True, text=True
+                command("artifacts", "verify", arguments[1]), env=ENV, capture_output=True, text=True
             )
             if found.returncode:
                 damage.problems.append(found.stdout + found.stderr)
-        if digests(module, *arguments) != calm:
+        if digests(*arguments) != calm:
             damage.problems.append(f"seed {number}: other bytes than an undisturbed run")
         damage.pipelines += 1
         print(f"{damage.kills} kills, {damage.pipelines} pipelines, {len(damage.problems)} problems", flush=True)
@@ -92,11 +92,10 @@ def storm(folder: Path, kills: int, module: str = "toy", shards: int = 8, seed: 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=1000)
-    parser.add_argument("--real", action="store_true")
     options = parser.parse_args()
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        damage = storm(Path(folder), options.kills, "stages.cli" if options.real else "toy")
+        damage = storm(Path(folder), options.kills)
     redone = damage.shards_written - damage.shards_needed
     print(f"{damage.kills} kills, {damage.pipelines} pipelines, {time.monotonic() - began:.0f} s")
     print(f"{redone} shards written twice, {len(damage.problems)} problems")

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
-from wbm.artifacts import backend, compare, lineage, migrate, zarr_io
+from wbm.artifacts import backend, collector, compare, migrate, zarr_io
 from wbm.artifacts import manifest as manifests
 from wbm.artifacts import store as stores
 from wbm.artifacts.digest import canonical_json, digest_bytes, digest_content, digest_file, plain
@@ -217,7 +217,7 @@ def test_disk_full_at_any_point_loses_nothing(small_disk):
         assert attempt(store, room), "with room the same call goes on"
         assert store.verify() == []
         store.remove("assets/next")
-        lineage.collect(store, lineage.garbage(store, grace_s=0), grace_s=0)
+        collector.collect(store, collector.garbage(store, grace_s=0), grace_s=0)
         room += 4096
     assert room > 10 * 4096, "there should be many points to stop at"
     assert store.names() == [kept.ref]

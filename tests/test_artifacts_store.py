@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from artifacts_support import manifest, publish, s3_server
 
-from wbm.artifacts import lease, lineage, transfer
+from wbm.artifacts import collector, lease, lineage, transfer
 from wbm.artifacts.errors import ArtifactError, Conflict, Missing
 from wbm.artifacts.lease import acquire
 from wbm.artifacts.store import Store
@@ -94,9 +94,9 @@ def test_gc_keeps_what_latest_and_pins_reach(store):
     user = publish(store, {"b": b"2"}, kind="student", inputs={"assets": old[0]})
     store.pin(old[1].ref)
     newest = publish(store, {"a": b"9"}, seed=9)
-    found = lineage.garbage(store, grace_s=0)
+    found = collector.garbage(store, grace_s=0)
     assert found.artifacts == [old[2].ref], "reached: 0 by the student, 1 by its pin, 9 by latest"
-    lineage.collect(store, found, grace_s=0)
+    collector.collect(store, found, grace_s=0)
     assert store.names() == sorted([old[0].ref, old[1].ref, newest.ref, user.ref])
     assert store.verify() == []
 
@@ -105,10 +105,10 @@ def test_gc_leaves_live_and_young_attempts_alone(store):
     live = store.begin(manifest(seed=1))
     dead = store.begin(manifest(seed=2))
     dead.keep()
-    assert lineage.garbage(store, grace_s=3600).folders == []
-    doomed = lineage.garbage(store, grace_s=0)
+    assert collector.garbage(store, grace_s=3600).folders == []
+    doomed = collector.garbage(store, grace_s=0)
     assert {path.name.removesuffix(".scratch") for path in doomed.folders} == {dead.path.name}
-    lineage.collect(store, doomed, grace_s=0)
+    collector.collect(store, doomed, grace_s=0)
     assert live.path.is_dir() and not dead.path.exists()
     live.keep()
 

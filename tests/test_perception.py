@@ -6,8 +6,8 @@ import torch
 import warp as wp
 
 from wbm.control.links import LinkPoses
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.model import forward_kinematics, frame_poses, load_robot
+from wbm.robot.rotations import quat_to_mat
 from wbm.robot.spheres import sample_configurations
 
 TOLERANCE_M = 2e-6  # float32 over a chain of 20 links of at most 10 m

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from wbm.robot import joints, model
-from wbm.robot.facts import parse_facts, quat_to_mat
+from wbm.robot.facts import parse_facts
+from wbm.robot.rotations import quat_to_mat
 
 TOLERANCE = 1e-6  # m and rad: what the project promises against the published descriptions
 FACTS = parse_facts().value

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from wbm.robot import joints, mjcf, model, spheres
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.geometry import BOX, CAPSULE, CYLINDER
+from wbm.robot.rotations import quat_to_mat
 
 LONG_ARM = Path(__file__).parents[1] / "docs" / "examples" / "long_arm.yaml"
 

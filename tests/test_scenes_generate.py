@@ -2,19 +2,19 @@
 
 from dataclasses import replace
 
-import mjbatch
 import numpy as np
 import pytest
 from scenes_small import SCENES, small_bank, small_model, small_objects
 
+from benchmarks.scenes_at_rest import at_rest
 from wbm.robot import joints, spheres
+from wbm.robot.rotations import rotate
 from wbm.scenes import generate
-from wbm.scenes.bank import SIDE, SceneBank, rotate
+from wbm.scenes.bank import SIDE, SceneBank
 from wbm.scenes.config import KINDS, ScenesConfig
 from wbm.scenes.layout import draw_layout
 from wbm.scenes.placement import draw_scene, self_clearance
 from wbm.sim.config import EVALUATE, TRAIN
-from wbm.sim.simulation import apply_options
 
 
 def test_bank_has_what_was_asked_for():
@@ -30,23 +30,10 @@ def test_bank_has_what_was_asked_for():
 
 @pytest.mark.parametrize("cfg", [TRAIN, EVALUATE], ids=["train", "evaluate"])
 def test_nothing_moves_in_a_second_and_no_start_touches(cfg):
-    scenes, bank = small_model(), small_bank()
-    apply_options(scenes.model, cfg)
-    count = len(bank)
-    batch = mjbatch.Batch(scenes.model, count, 2)
-    fields = {name: batch.expand(name) for name in scenes.fields}
-    qpos = batch.bind("qpos")
-    scenes.load_scene(fields.__getitem__, qpos, np.arange(count), bank, np.arange(count))
-    batch.bind("ctrl")[:] = bank.q_start
-    touched = [batch.sensor(name) for name in scenes.sensors if name.startswith(("robot_", "hand_"))]
-    before = qpos[:, scenes.object_qpos].reshape(count, -1, 7).copy()
-    for _ in range(10):
-        batch.step(nstep=round(0.1 / cfg.dt))
-        assert all((values[:, 0] == 0).all() for values in touched)
-    after = qpos[:, scenes.object_qpos].reshape(count, -1, 7)
-    moved = np.linalg.norm(after[..., :3] - before[..., :3], axis=2)
-    assert moved.max() < 0.005
-    assert (after[..., 2] > bank.surface_z[:, None])[bank.object >= 0].all()
+    for row in at_rest(small_model(), small_bank(), cfg, seconds=1.0, threads=2):
+        assert row["scenes"] > 0, row
+        assert row["largest_move_mm"] < 5.0, row
+        assert row["moved_or_fell"] == 0 and row["starts_in_contact"] == 0, row
 
 
 def test_objects_stand_apart_and_on_the_surface():

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes_small import small_bank, small_objects
 
+from wbm.robot.rotations import rotate
 from wbm.scenes import encoder, instructions
-from wbm.scenes.bank import rotate
 from wbm.scenes.instructions import HELD_OUT, TRAINING, Texts, descriptions, write_instructions
 
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 from scenes_small import small_bank, small_model, small_objects
 
-from wbm.scenes.bank import NUM_SUPPORTS, Boxes, multiply, obstacle_boxes, rotate
+from wbm.robot.rotations import multiply, rotate
+from wbm.scenes.bank import NUM_SUPPORTS, Boxes, obstacle_boxes
 from wbm.scenes.model import SceneModel, SceneModelConfig
 from wbm.scenes.parts import BOX, part_mesh
 from wbm.scenes.placement import clearance

@@ -6,8 +6,8 @@ from browser import chromium, page_of
 from scenes_small import small_bank, small_model, small_objects
 
 from wbm.report.gallery import COLUMNS, PITCH, gallery_tracks
+from wbm.robot.rotations import rotate
 from wbm.scenes.assets import Assets
-from wbm.scenes.bank import rotate
 from wbm.scenes.instructions import Texts, write_instructions
 
 

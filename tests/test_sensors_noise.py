@@ -25,7 +25,6 @@ from wbm.sensors.scene import BOX, Instances, RayScene, Semantic
 
 QUIET_DEPTH = {"subpixel": 0.0, "drop": 0.0, "edge": 0.0}
 QUIET_LIDAR = {"sigma": 0.0, "drop": 0.0, "drop_far": 0.0, "sparsity": 0.0}
-UP_QUAT = (1.0, 0.0, 0.0, 0.0)
 
 
 def wall_scene(num_envs: int, distance: float, size=(10.0, 10.0, 0.5)) -> RayScene:

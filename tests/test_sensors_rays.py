@@ -10,8 +10,8 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.model import load_robot
+from wbm.robot.rotations import quat_to_mat
 from wbm.sensors.bench_scene import robot_bodies, sample_meshes, tabletop
 from wbm.sensors.bundles import GROUP, SUBGROUP, build_table, common_part
 from wbm.sensors.config import DepthConfig, LidarConfig

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from wbm.robot.rotations import mat_to_quat
 from wbm.sensors import bench
-from wbm.sensors.poses import look_at, mat_to_quat, optical_axis
+from wbm.sensors.poses import look_at, optical_axis
 from wbm.sensors.render import Renderer, render_rgb
 from wbm.sensors.scene import BOX, SPHERE, Instances, RayScene, floor_instance
 

@@ -24,18 +24,15 @@ def _probe(
     i = wp.tid()
     qa = se3.quat_wxyz_normalize(a[i])
     qb = se3.quat_wxyz_normalize(b[i])
-    e = se3.rotation_error(qa, qb)
     vec4_out[i, 0] = se3.quat_wxyz_mul(qa, qb)
     vec4_out[i, 1] = se3.quat_wxyz_exp(v[i])
     vec4_out[i, 2] = se3.mat_to_quat_wxyz(se3.quat_wxyz_to_mat(qa))
-    vec4_out[i, 3] = se3.quat_xyzw_to_wxyz(se3.quat_wxyz_to_xyzw(qa))
     vec3_out[i, 0] = se3.quat_wxyz_rotate(qa, v[i])
     vec3_out[i, 1] = se3.quat_wxyz_rotate_inv(qa, v[i])
     vec3_out[i, 2] = se3.quat_wxyz_log(qa)
-    vec3_out[i, 3] = e
-    vec3_out[i, 4] = se3.pose_inv_mul_pos(v[i], qb, se3.pose_mul_pos(v[i], qb, v[i]))
+    vec3_out[i, 3] = se3.rotation_error(qa, qb)
+    vec3_out[i, 4] = se3.pose_inv_mul_pos(v[i], qb, -v[i])
     mat_out[i, 0] = se3.quat_wxyz_to_mat(qa)
-    mat_out[i, 1] = se3.rotation_error_jacobian(e)
 
 
 def probe(a, b, v):
@@ -45,7 +42,7 @@ def probe(a, b, v):
         for x, t in ((a, wp.vec4), (b, wp.vec4), (v, wp.vec3))
     ]
     out = [
-        wp.full((n, k), value=t(np.inf), dtype=t, device="cpu") for k, t in ((4, wp.vec4), (5, wp.vec3), (2, wp.mat33))
+        wp.full((n, k), value=t(np.inf), dtype=t, device="cpu") for k, t in ((3, wp.vec4), (5, wp.vec3), (1, wp.mat33))
     ]
     wp.launch(_probe, dim=n, inputs=arrays, outputs=out, device="cpu")
     return [o.numpy().astype(np.float64) for o in out]
@@ -71,28 +68,13 @@ def test_against_scipy():
     assert same_rotation(vec4[:, 0], ra * rb).max() < TOL
     assert same_rotation(vec4[:, 1], Rotation.from_rotvec(v)).max() < TOL
     assert same_rotation(vec4[:, 2], ra).max() < TOL
-    assert same_rotation(vec4[:, 3], ra).max() < TOL
     assert np.abs(vec3[:, 0] - ra.apply(v)).max() < 2 * TOL
     assert np.abs(vec3[:, 1] - ra.inv().apply(v)).max() < 2 * TOL
     assert np.abs(Rotation.from_rotvec(vec3[:, 2]).as_matrix() - ra.as_matrix()).max() < 2 * TOL
     assert np.abs((Rotation.from_rotvec(vec3[:, 3]) * rb).as_matrix() - ra.as_matrix()).max() < 4 * TOL
-    assert np.abs(vec3[:, 4] - v).max() < 4 * TOL
+    assert np.abs(vec3[:, 4] - rb.inv().apply(-2 * v)).max() < 4 * TOL
     assert np.abs(mat[:, 0] - ra.as_matrix()).max() < TOL
     assert np.linalg.norm(vec3[:, 2], axis=-1).max() <= np.pi + TOL
-
-
-def test_rotation_error_jacobian_against_finite_differences():
-    rng = np.random.default_rng(1)
-    a, b = rng.normal(size=(200, 4)), rng.normal(size=(200, 4))
-    ra, rb = to_rot(a), to_rot(b)
-    far = np.linalg.norm((ra * rb.inv()).as_rotvec(), axis=-1) < 3.0  # the logarithm itself jumps at pi
-    _, _, mat = probe(a, b, np.zeros((200, 3)))
-    h = 1e-6
-    for k in range(3):
-        turn = Rotation.from_rotvec(np.eye(3)[k] * h)
-        fd = ((ra * (turn * rb).inv()).as_rotvec() - (ra * (turn.inv() * rb).inv()).as_rotvec()) / (2 * h)
-        assert np.abs(mat[far, 1, :, k] - fd[far]).max() < 2e-4
-    assert far.sum() > 150
 
 
 @settings(max_examples=60, deadline=None)

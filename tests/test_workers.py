@@ -15,16 +15,31 @@ PARENT = """
 import sys
 from wbm.learning.workers import run_jobs
 if __name__ == "__main__":
-    for answer in run_jobs("worker_jobs", [("pid", 0), ("sleep", 600)], 2):
+    for answer in run_jobs("worker_jobs", {jobs}, 2):
         print(answer, flush=True)
 """
 JOBS = """
-import os, time
+import multiprocessing, os, time
 def work(job):
+    global kept
     what, seconds = job
     time.sleep(seconds)
+    if what == "lock":
+        kept = multiprocessing.get_context("spawn").Lock()
     return os.getpid() if what == "pid" else None
 """
+
+
+def start(folder, jobs="[('pid', 0), ('sleep', 600)]", **env):
+    (folder / "worker_jobs.py").write_text(JOBS)
+    (folder / "parent.py").write_text(PARENT.format(jobs=jobs))
+    paths = os.pathsep.join([str(folder), str(Path(__file__).parent.parent)])
+    return subprocess.Popen(
+        [sys.executable, folder / "parent.py"],
+        env={**os.environ, "PYTHONPATH": paths, **env},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
 
 
 def running(pid):
@@ -36,12 +51,8 @@ def running(pid):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel's help is Linux's")
 def test_workers_die_with_a_parent_that_was_killed(tmp_path):
-    (tmp_path / "worker_jobs.py").write_text(JOBS)
-    (tmp_path / "parent.py").write_text(PARENT)
-    paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parent.parent)])
-    parent = subprocess.Popen(
-        [sys.executable, tmp_path / "parent.py"], env={**os.environ, "PYTHONPATH": paths}, stdout=subprocess.PIPE
-    )
+    # Whoever is killed cannot give back the pool's semaphores; that the tracker says so is no news here.
+    parent = start(tmp_path, PYTHONWARNINGS="ignore:resource_tracker")
     worker = int(parent.stdout.readline())
     children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
     assert str(worker) in children
@@ -51,6 +62,12 @@ def test_workers_die_with_a_parent_that_was_killed(tmp_path):
     while any(running(pid) for pid in children):
         assert time.monotonic() < end, "a worker outlived its parent"
         time.sleep(0.05)
+
+
+def test_workers_give_back_what_they_held(tmp_path):
+    """A library may keep a semaphore for the life of its process: the resource tracker must find none left."""
+    _, complaint = start(tmp_path, "[('lock', 0), ('lock', 0)]").communicate()
+    assert complaint == b""
 
 
 def test_no_jobs_start_no_process():

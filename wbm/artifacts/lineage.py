@@ -1,17 +1,14 @@
-"""What an artifact came from, what came from it, what differs between two, and what nothing needs any more."""
+"""What an artifact came from, what came from it, and what differs between two."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from wbm.artifacts.errors import ArtifactError
 from wbm.artifacts.manifest import Manifest
 from wbm.artifacts.store import Store
-
-GRACE_S = 24 * 3600.0
 
 
 @dataclass(frozen=True)
@@ -97,55 +94,3 @@ def differences(old: Any, new: Any, where: str = "", *, nested: bool = True) -> 
         return out
     same = old == new or (old != old and new != new)  # NaN equals NaN here
     return [] if same else [(where, old, new)]
-
-
-@dataclass(frozen=True)
-class Garbage:
-    """What `gc` would delete: artifacts that nothing reaches, and folders of interrupted or failed attempts."""
-
-    artifacts: list[str] = field(default_factory=list)
-    folders: list[Path] = field(default_factory=list)
-    bytes: int = 0
-
-
-def garbage(store: Store, grace_s: float = GRACE_S) -> Garbage:
-    """Find what nothing reaches from `latest` references and pins, through the inputs of each artifact.
-
-    Args:
-        store: where to look.
-        grace_s: leave alone what is younger: artifacts by creation, folders by last change (seconds).
-    """
-    manifests = load_all(store)
-    latest = {m.ref for m in (store.latest(*name) for name in {(m.kind, m.name) for m in manifests.values()}) if m}
-    reached = _closure(latest | set(store.pins()), manifests)
-    artifacts = sorted(set(manifests) - reached)
-    folders = store.stale_staging(grace_s)
-    size = sum(manifests[ref].size for ref in artifacts)
-    size += sum(f.stat().st_size for folder in folders for f in folder.rglob("*") if f.is_file())
-    return Garbage(artifacts, folders, size)
-
-
-def _closure(roots: Iterable[str], manifests: Mapping[str, Manifest]) -> set[str]:
-    reached: set[str] = set()
-    todo = list(roots)
-    while todo:
-        ref = todo.pop()
-        if ref not in reached:
-            reached.add(ref)
-            todo += [i.ref for i in manifests[ref].inputs.values()] if ref in manifests else []
-    return reached
-
-
-def collect(store: Store, found: Garbage, grace_s: float = GRACE_S) -> None:
-    """Delete what `garbage` found, users before what they were made from."""
-    manifests = {ref: store.manifest(ref) for ref in found.artifacts}
-    left = set(found.artifacts)
-    while left:
-        used = {i.ref for ref in left for i in manifests[ref].inputs.values()}
-        for ref in sorted(left - used) or sorted(left):
-            store.remove(ref, force=True)
-            left.discard(ref)
-    for folder in found.folders:
-        store.drop_folder(folder)
-    store.forget_leases()
-    store.backend.sweep(grace_s)

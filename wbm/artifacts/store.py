@@ -1,4 +1,4 @@
-"""The artifact store: resolve names, draft and publish artifacts, move references, pin, verify, collect."""
+"""The artifact store: resolve names, draft and publish artifacts, move references, pin, verify, remove."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from typing import Any
 from wbm.artifacts.backend import ABSENT, Backend, LocalBackend
 from wbm.artifacts.digest import KEY_LENGTH
 from wbm.artifacts.errors import ArtifactError, Conflict, Missing
-from wbm.artifacts.files import fsync_path, make_dirs, remove_tree
-from wbm.artifacts.lease import Lease, acquire, is_held, is_live
+from wbm.artifacts.files import fsync_path, make_dirs
+from wbm.artifacts.lease import Lease, acquire
 from wbm.artifacts.manifest import MANIFEST, NAME, Artifact, Manifest, check_files, parse_manifest, seal
 from wbm.artifacts.reference import References, is_reference
 
@@ -313,28 +313,6 @@ class Store:
                 self.backend.delete(f"refs/{kind}/{name}/latest")
         self.backend.remove(ref)  # after the reference, which must never point to nothing
         return ref
-
-    def stale_staging(self, grace_s: float) -> list[Path]:
-        """Staging and quarantine folders that no live process holds and nobody touched for `grace_s` seconds."""
-        found = []
-        for area in (".staging", ".quarantine"):
-            for path in sorted((self.backend.work / area).glob("*/*/*")):
-                ref = path.relative_to(self.backend.work / area).as_posix().removesuffix(".scratch")
-                idle = time.time() - max(path.stat().st_mtime, path.stat().st_ctime)
-                if idle >= grace_s and not (area == ".staging" and is_held(self.backend, ref)):
-                    found.append(path)
-        return found
-
-    def forget_leases(self) -> None:
-        """Delete the records of leases that nobody holds and whose attempt left nothing behind."""
-        for path in self.backend.records("leases"):
-            staging = self.backend.work / ".staging" / path.removeprefix("leases/")
-            if not is_live(self.backend, path) and not staging.exists():
-                self.backend.delete(path)
-
-    def drop_folder(self, folder: Path) -> None:
-        """Delete a staging or quarantine folder."""
-        remove_tree(folder)
 
     def _expand(self, text: str) -> str:
         parts = text.strip("/").split("/")

@@ -15,8 +15,8 @@ from pathfinding.core.grid import Grid
 from pathfinding.finder.a_star import AStarFinder
 
 from wbm.robot import joints
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.model import RobotModel
+from wbm.robot.rotations import quat_to_mat
 from wbm.robot.spheres import robot_spheres, sphere_positions
 
 CELL = 0.1  # m

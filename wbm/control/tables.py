@@ -8,9 +8,9 @@ import numpy as np
 import warp as wp
 
 from wbm.kernels.kinematics import Tree
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.joints import BASE, NECK, WBC
 from wbm.robot.model import FIXED, SLIDE, RobotModel, forward_kinematics, frame_poses
+from wbm.robot.rotations import quat_to_mat
 from wbm.robot.spheres import SphereSet
 
 

@@ -20,7 +20,6 @@ from wbm.deploy.instructions import InstructionCache
 from wbm.deploy.policy import OnnxPolicy
 from wbm.deploy.signature import check_signature, sign
 
-SUFFIX = ".wbm"
 _REQUIRED = ("checksums.json", "contract.json", "golden.npz", "instructions.npz", "policy.onnx", "provenance.json")
 _ALLOWED = frozenset((*_REQUIRED, "signature.json"))
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from wbm.deploy.contract import Contract
 from wbm.robot.proprio import FRAMES, proprioception, quat_to_mat
+from wbm.robot.rotations import mat_to_quat
 
 
 class Kinematics:
@@ -70,19 +71,3 @@ class Kinematics:
         quat = np.array([[mat_to_quat(frames[n][0]) for n in FRAMES]])
         pos = np.array([[frames[n][1] for n in FRAMES]])
         return proprioception(np, q[None], qd[None], pos, quat)[0].astype(np.float32)
-
-
-def mat_to_quat(rot: np.ndarray) -> np.ndarray:
-    """Unit quaternion (w x y z) of a rotation matrix, by its largest component (Shepperd 1978)."""
-    (a, b, c), (d, e, f), (g, h, i) = rot.tolist()
-    trace = a + e + i
-    largest = max(trace, a, e, i)
-    if largest == trace:
-        quat = (1 + trace, h - f, c - g, d - b)
-    elif largest == a:
-        quat = (h - f, 1 + a - e - i, d + b, g + c)
-    elif largest == e:
-        quat = (c - g, d + b, 1 + e - i - a, h + f)
-    else:
-        quat = (d - b, g + c, h + f, 1 + i - a - e)
-    return np.array(quat) / np.sqrt(sum(x * x for x in quat))

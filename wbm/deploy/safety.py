@@ -12,7 +12,6 @@ from wbm.deploy.faults import Fault, Refused
 from wbm.robot import joints
 
 _CLOUDS = {"depth": ("camera", "depth_xyz", "depth_valid"), "lidar": ("lidar", "lidar_xyz", "lidar_valid")}
-_DEGREES = 180.0 / math.pi
 _STIFF = np.r_[joints.BASE, joints.ARM, joints.NECK]  # joints that contact cannot stop within a step
 _CLOCK_SLACK_S = 1e-3
 

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wbm.scenes.bank import SceneBank, obstacle_boxes, rotate
+from wbm.robot.rotations import rotate
+from wbm.scenes.bank import SceneBank, obstacle_boxes
 from wbm.scenes.model import SceneModel
 from wbm.sim.simulation import Simulation
 

@@ -1,5 +1,7 @@
 """Late and lost frames: which frame is delivered, and the ring buffer that keeps it until then."""
 
+from typing import Any
+
 import warp as wp
 
 from wbm.kernels.noise import STREAM_DELAY, STREAM_FRAME, noise_state
@@ -61,14 +63,14 @@ def pass_frame(
     env_ids: wp.array[int],  # [n]
     write: wp.array[int],  # [N]
     read: wp.array[int],  # [N]
-    chunk: int,  # words of a thread
-    frame: wp.array2d[wp.uint32],  # [N,W] words
+    chunk: int,  # units of a thread
+    frame: wp.array2d[Any],  # [N,W] units
     # inout:
-    ring_io: wp.array3d[wp.uint32],  # [N,ring,W]
+    ring_io: wp.array3d[Any],  # [N,ring,W]
     # out:
-    frame_out: wp.array2d[wp.uint32],  # [N,W]
+    frame_out: wp.array2d[Any],  # [N,W]
 ):
-    """Store the new frame's words and hand out the delivered frame's."""
+    """Store the new frame's units (words or bytes) and hand out the delivered frame's."""
     i, c = wp.tid()
     env = env_ids[i]
     put = write[env]
@@ -78,24 +80,11 @@ def pass_frame(
         frame_out[env, w] = ring_io[env, get, w]
 
 
-@wp.kernel(enable_backward=False)
-def pass_frame_bytes(
-    # in:
-    env_ids: wp.array[int],  # [n]
-    write: wp.array[int],  # [N]
-    read: wp.array[int],  # [N]
-    chunk: int,  # bytes of a thread
-    frame: wp.array2d[wp.uint8],  # [N,W]
-    # inout:
-    ring_io: wp.array3d[wp.uint8],  # [N,ring,W]
-    # out:
-    frame_out: wp.array2d[wp.uint8],  # [N,W]
-):
-    """The same for rows that are no whole number of words."""
-    i, c = wp.tid()
-    env = env_ids[i]
-    put = write[env]
-    get = read[env]
-    for w in range(c * chunk, wp.min((c + 1) * chunk, frame.shape[1])):
-        ring_io[env, put, w] = frame[env, w]
-        frame_out[env, w] = ring_io[env, get, w]
+# Named here, so that they belong to the module from the start: an instance made by its first launch compiles it anew.
+PASS_FRAME = {
+    unit: wp.overload(
+        pass_frame, {"frame": wp.array2d[unit], "ring_io": wp.array3d[unit], "frame_out": wp.array2d[unit]}
+    )
+    for unit in (wp.uint32, wp.uint8)
+}
+"""The kernel for rows of whole words and for rows of bytes."""

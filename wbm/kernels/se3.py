@@ -10,7 +10,6 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-TINY = wp.constant(1.0e-12)
 SMALL_ANGLE = wp.constant(1.0e-3)
 
 
@@ -18,18 +17,6 @@ SMALL_ANGLE = wp.constant(1.0e-3)
 def quat_wxyz_identity() -> wp.vec4:
     """The rotation by nothing."""
     return wp.vec4(1.0, 0.0, 0.0, 0.0)
-
-
-@wp.func
-def quat_wxyz_to_xyzw(q: wp.vec4) -> wp.quatf:
-    """Warp's quaternion (x y z w) from w x y z."""
-    return wp.quatf(q[1], q[2], q[3], q[0])
-
-
-@wp.func
-def quat_xyzw_to_wxyz(q: wp.quatf) -> wp.vec4:
-    """Quaternion w x y z from Warp's x y z w."""
-    return wp.vec4(q[3], q[0], q[1], q[2])
 
 
 @wp.func
@@ -137,43 +124,9 @@ def quat_wxyz_log(q: wp.vec4) -> wp.vec3:
 
 
 @wp.func
-def quat_wxyz_integrate(q: wp.vec4, omega: wp.vec3, dt: float) -> wp.vec4:
-    """`exp(omega dt) q` for an angular velocity in the world frame, rad/s."""
-    return quat_wxyz_normalize(quat_wxyz_mul(quat_wxyz_exp(omega * dt), q))
-
-
-@wp.func
 def rotation_error(q_WD: wp.vec4, q_WB: wp.vec4) -> wp.vec3:
     """Angle-axis error `log(R_WD R_WB^T)` in the world frame, rad: the rotation that takes B onto D."""
     return quat_wxyz_log(quat_wxyz_mul(q_WD, quat_wxyz_inverse(q_WB)))
-
-
-@wp.func
-def so3_left_jacobian_inv(r: wp.vec3) -> wp.mat33:
-    """Inverse of the left Jacobian of SO(3) at the rotation vector `r` with |r| <= pi.
-
-    `J_l^-1 = I - [r]/2 + (1/t^2 - (1 + cos t)/(2 t sin t)) [r]^2`, `t = |r|` (Sola et al., 2018, eq. 146). With
-    `e = log(R_WD R_WB^T)` and B turning at `omega_W`, `e_dot = -J_l(-e)^-1 omega_W`.
-    """
-    t = wp.length(r)
-    c = 1.0 / 12.0 + t * t / 720.0
-    if t > 0.05:
-        # (1 + cos t)/sin t = cot(t/2), which stays finite at t = pi.
-        c = (1.0 - 0.5 * t * wp.cos(0.5 * t) / wp.sin(0.5 * t)) / (t * t)
-    k = wp.skew(r)
-    return wp.identity(n=3, dtype=float) - 0.5 * k + c * (k * k)
-
-
-@wp.func
-def rotation_error_jacobian(e: wp.vec3) -> wp.mat33:
-    """`d rotation_error / dt = J omega_WB_W`, the exact derivative of the angle-axis error in B's rotation."""
-    return -so3_left_jacobian_inv(-e)
-
-
-@wp.func
-def pose_mul_pos(p_AB: wp.vec3, q_AB: wp.vec4, p_BC: wp.vec3) -> wp.vec3:
-    """`p_AC = p_AB + R_AB p_BC`: a point from frame B into frame A."""
-    return p_AB + quat_wxyz_rotate(q_AB, p_BC)
 
 
 @wp.func

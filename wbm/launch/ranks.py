@@ -8,8 +8,3 @@ import os
 def rank() -> int:
     """Number of this process among those of a job; 0 writes the results."""
     return int(os.environ.get("RANK", "0"))
-
-
-def world_size() -> int:
-    """How many processes share the work."""
-    return int(os.environ.get("WORLD_SIZE", "1"))

@@ -27,7 +27,6 @@ from wbm.scenes.procedural import draw_objects
 from wbm.sim.config import TRAIN
 
 PARTS = ("physics", "wbc", "observe", "reward", "reset", "policy", "update")
-_COLLECTING = PARTS[:-1]
 
 
 def bench_env(num_envs: int = 128, iterations: int = 3, seed: int = 0) -> dict[str, Any]:

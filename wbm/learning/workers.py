@@ -37,6 +37,9 @@ def run_jobs(module: str, jobs: Sequence[Any], workers: int) -> Iterator[Any]:
         futures: list[Future] = [pool.submit(_work, module, job) for job in jobs]
         for future in as_completed(futures):
             yield future.result()
+        # All is done: a worker that ends by itself gives back the semaphores of the libraries that it loaded, where one
+        # that is terminated leaves them to multiprocessing's resource tracker, which then warns of a leak.
+        pool.shutdown(wait=True)
     finally:
         for process in list((pool._processes or {}).values()):
             process.terminate()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -152,11 +152,3 @@ def jpeg_bytes(frame: np.ndarray, quality: int = 82) -> bytes:
 def data_uri(data: bytes, media_type: str) -> str:
     """Bytes as a `data:` URI."""
     return f"data:{media_type};base64,{base64.b64encode(data).decode()}"
-
-
-def contact_sheet(frames: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
-    """Frames of one height side by side on white."""
-    height = frames[0].shape[0]
-    bar = np.full((height, gap, 3), 255, dtype=np.uint8)
-    parts = [part for frame in frames for part in (frame, bar)]
-    return np.concatenate(parts[:-1], axis=1)

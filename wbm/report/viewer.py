@@ -11,13 +11,14 @@ from typing import Any, Protocol
 import numpy as np
 import viser
 
-from wbm.artifacts.mcap_io import BOX, CAPSULE, CYLINDER, MESH, SPHERE, EpisodeTracks
+from wbm.artifacts.mcap_io import EpisodeTracks
+from wbm.report.drawing import add_robot, add_solid
 from wbm.report.sight import sight_image
 from wbm.report.tracks import mats_to_quats
 from wbm.robot.model import RobotModel, load_robot
 from wbm.robot.proprio import quat_to_mat
 from wbm.robot.schema import ActionSpec, to_target
-from wbm.robot.spheres import batched_kinematics, robot_spheres
+from wbm.robot.spheres import batched_kinematics
 
 _TARGET_RGB = np.array([255, 70, 20], dtype=np.uint8)
 _LIDAR_RGB = np.array([60, 130, 220], dtype=np.uint8)
@@ -79,7 +80,7 @@ class Viewer:
         self.server.initial_camera.look_at = (0.3, 0.0, 0.6)
         self.server.scene.set_up_direction("+z")
         self.server.scene.add_grid("/floor", width=12, height=12, cell_size=0.5, section_size=1.0, position=(0, 0, 0))
-        self._links, self._spheres = self._add_robot()
+        self._links, self._spheres = add_robot(self.server.scene, self.robot)
         self._add_controls()
         self._parts: dict[str, Any] = {}
         self._item = items[0]
@@ -117,27 +118,6 @@ class Viewer:
             if self._scrub.value != k:
                 self._scrub.value = k
         self._follow()
-
-    def _add_robot(self) -> tuple[dict[int, Any], list[Any]]:
-        scene, links, spheres = self.server.scene, {}, []
-        for i, name in enumerate(self.robot.link_names):
-            links[i] = scene.add_frame(f"/robot/{name}", show_axes=False)
-        for geom in self.robot.geoms:
-            path = f"/robot/{geom.link}/{geom.name}"
-            _add_solid(scene, path, geom.type, geom.size, geom.rgb, geom.pos, geom.quat)
-        ball = robot_spheres(self.robot)
-        for k in range(len(ball)):
-            handle = scene.add_icosphere(
-                f"/robot/{self.robot.link_names[ball.link[k]]}/sphere_{k}",
-                radius=float(ball.radius[k]),
-                color=(240, 170, 40),
-                opacity=0.35,
-                subdivisions=2,
-                position=tuple(ball.pos[k]),
-                visible=False,
-            )
-            spheres.append(handle)
-        return links, spheres
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -218,7 +198,7 @@ class Viewer:
             moves = np.ndim(solid.pos) == 2
             first = (solid.pos[0], solid.quat[0]) if moves else (solid.pos, solid.quat)
             path, shape = f"/scene/{i}", (solid.type, solid.size, solid.rgba[:3])
-            handle = _add_solid(self.server.scene, path, *shape, *first, solid.vertices, solid.faces)
+            handle = add_solid(self.server.scene, path, *shape, *first, solid.vertices, solid.faces)
             handle.visible = self._layers["Scene"].value
             self._parts[f"solid {i}"] = handle
             self._groups["solids"].append(handle)
@@ -360,37 +340,3 @@ def _first_steps(live: Live) -> tuple[EpisodeTracks, np.ndarray, int]:
         time.sleep(0.05)
     number, tracks, mask = news
     return tracks, mask, number
-
-
-def _add_solid(
-    scene: Any,
-    path: str,
-    kind: int,
-    size: Any,
-    rgb: Any,
-    pos: Any,
-    quat: Any,
-    vertices: np.ndarray | None = None,
-    faces: np.ndarray | None = None,
-) -> Any:
-    """Draw a primitive (MuJoCo's numbers and half sizes) or a mesh; returns the handle that carries its pose."""
-    colour = tuple(round(255 * float(c)) for c in rgb[:3])
-    pose = {"position": tuple(float(v) for v in pos), "wxyz": tuple(float(v) for v in quat)}
-    if kind == BOX:
-        return scene.add_box(path, color=colour, dimensions=tuple(2 * float(s) for s in size), **pose)
-    if kind == SPHERE:
-        return scene.add_icosphere(path, radius=float(size[0]), color=colour, **pose)
-    if kind in (CYLINDER, CAPSULE):
-        radius, half = float(size[0]), float(size[1])
-        if kind == CYLINDER:
-            return scene.add_cylinder(path, radius=radius, height=2 * half, color=colour, **pose)
-        root = scene.add_frame(path, show_axes=False, **pose)
-        scene.add_cylinder(f"{path}/tube", radius=radius, height=2 * half, color=colour)
-        for name, z in (("top", half), ("bottom", -half)):
-            scene.add_icosphere(f"{path}/{name}", radius=radius, color=colour, position=(0.0, 0.0, z))
-        return root
-    if kind == MESH and vertices is not None and faces is not None:
-        return scene.add_mesh_simple(
-            path, np.float32(vertices), np.uint32(faces), color=colour, flat_shading=True, **pose
-        )
-    raise ValueError(f"geometry type {kind} of {path} cannot be drawn")

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from wbm.robot.rotations import unit_quat
+
 STANDARD = ("facts.yaml", "platform.yaml")
 """Beside this file: the published numbers, and this project's own choices. A user's file is laid over both."""
 
@@ -157,20 +159,3 @@ def standard_text() -> str:
 @cache
 def _standard() -> dict[str, Any]:
     return _parse(standard_text().encode())
-
-
-def unit_quat(quat: Any) -> np.ndarray:
-    """Return `quat` (w x y z) scaled to unit length, as MuJoCo does on load."""
-    q = np.asarray(quat, dtype=np.float64)
-    return q / np.linalg.norm(q)
-
-
-def quat_to_mat(quat: np.ndarray) -> np.ndarray:
-    """Rotation matrix [...,3,3] of a unit quaternion [...,4] (w x y z)."""
-    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

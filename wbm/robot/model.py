@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from wbm.robot import joints
-from wbm.robot.facts import Entry, parse_facts, quat_to_mat, read_facts, unit_quat
+from wbm.robot.facts import Entry, parse_facts, read_facts
 from wbm.robot.geometry import Geom, read_geoms
 from wbm.robot.parts import Inertial, PartJoint, PartLink, joint_range, part_links
+from wbm.robot.rotations import quat_to_mat, unit_quat
 
 FIXED, HINGE, SLIDE = 0, 1, 2
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wbm.robot.facts import Entry, quat_to_mat
+from wbm.robot.facts import Entry
+from wbm.robot.rotations import quat_to_mat
 
 MAX_LINKS = 64
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])

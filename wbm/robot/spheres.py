@@ -14,9 +14,9 @@ from itertools import product
 import numpy as np
 
 from wbm.robot import joints
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.geometry import BOX, CAPSULE, CYLINDER, SPHERE, Geom
 from wbm.robot.model import FIXED, HINGE, SLIDE, RobotModel
+from wbm.robot.rotations import quat_to_mat
 
 COVER_SLACK = 0.0045
 """How far (m) a surface point may lie outside every sphere; the promise to users is 5 mm."""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wbm.robot.rotations import multiply, rotate
 from wbm.scenes.parts import BOX
 
 NUM_SUPPORTS = 8
@@ -138,26 +139,4 @@ def obstacle_boxes(bank: SceneBank, objects, scenes: np.ndarray, with_target: bo
         body=np.broadcast_to(
             np.r_[np.full(NUM_SUPPORTS, -1), np.repeat(np.arange(slots), per)], (count, NUM_SUPPORTS + slots * per)
         ),
-    )
-
-
-def rotate(quat: np.ndarray, vec: np.ndarray) -> np.ndarray:
-    """Vectors [...,3] rotated by unit quaternions [...,4] (w x y z)."""
-    xyz, w = quat[..., 1:], quat[..., :1]
-    t = 2.0 * np.cross(xyz, vec)
-    return vec + w * t + np.cross(xyz, t)
-
-
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product [...,4] of quaternions (w x y z)."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
     )

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from wbm.robot.facts import quat_to_mat
+from wbm.robot.rotations import quat_to_mat
 from wbm.scenes.objects import ObjectSet
 
 

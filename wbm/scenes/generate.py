@@ -9,6 +9,7 @@ import mjbatch
 import mujoco
 import numpy as np
 
+from wbm.robot.rotations import quat_angle
 from wbm.scenes.bank import SceneBank, stack_scenes
 from wbm.scenes.cache import array_digest, code_digest, load_arrays, store_arrays
 from wbm.scenes.config import ScenesConfig
@@ -125,11 +126,6 @@ def simulate(model: SceneModel, bank: SceneBank, seconds: float) -> tuple[np.nda
     width = 1 + bank.num_distractors
     poses = qpos[:, model.object_qpos].reshape(len(bank), width, 7)
     return poses[..., :3].copy(), poses[..., 3:].copy(), touched
-
-
-def quat_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle (rad) between unit quaternions [...,4]."""
-    return 2 * np.arccos(np.clip(np.abs((a * b).sum(axis=-1)), 0.0, 1.0))
 
 
 def concatenate(banks: list[SceneBank]) -> SceneBank:

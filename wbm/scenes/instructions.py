@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wbm.scenes.bank import SceneBank, rotate
+from wbm.robot.rotations import rotate
+from wbm.scenes.bank import SceneBank
 from wbm.scenes.objects import ObjectSet
 
 NUM_TRAINING, NUM_HELD_OUT = 3, 1

@@ -14,18 +14,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from wbm.robot.facts import quat_to_mat
-from wbm.robot.mjcf import OBJECT_BIT, ROBOT_BIT, STATIC_BIT, MjcfOptions, add_contact_sensors, build_robot
+from wbm.robot.mjcf import OBJECT_BIT, STATIC_BIT, MjcfOptions, add_contact_sensors, build_robot
 from wbm.robot.model import RobotModel, load_robot
+from wbm.robot.rotations import quat_to_mat
 from wbm.scenes.bank import NUM_SUPPORTS, SceneBank
 from wbm.scenes.fields import body_tables, columns, write
 from wbm.scenes.objects import ObjectSet
 from wbm.scenes.parts import BOX, MAX_PARTS, MESH, Part, part_mesh
+from wbm.scenes.spec import EVERYTHING, add_mesh, add_slot, add_support, compile_with_hulls
 
 Field = Callable[[str], Any]
 """Returns the live per-environment values [N, ...] of a model field (NumPy array or torch tensor)."""
 
-EVERYTHING = ROBOT_BIT | OBJECT_BIT | STATIC_BIT
 PARK_DEPTH = -3.0
 ASIDE = 30.0
 # The compiler shortens kinematics where a geom's frame is its body's or its inertia's: here none may coincide.
@@ -82,7 +82,7 @@ class SceneModel:
         self.robot = robot or load_robot(self.robot_options.facts)
         self.bodies = ("target", *(f"distractor_{i}" for i in range(self.cfg.num_distractors)))
         self._mesh_of = _mesh_numbers(objects, self.cfg.slots)
-        self.model = _compile_with_hulls(self._template())
+        self.model = compile_with_hulls(self._template())
         model = self.model
         self.body_ids = np.array([model.body(name).id for name in self.bodies])
         self.support_geoms = np.array([model.geom(f"support_{i}").id for i in range(NUM_SUPPORTS)])
@@ -189,7 +189,7 @@ class SceneModel:
     def _template(self) -> mujoco.MjSpec:
         spec = self._base_spec()
         for i in range(NUM_SUPPORTS):
-            _add_support(spec, i, np.full(3, 0.5), np.array([0.0, 0.0, -5.0 - i]), np.asarray(_TILT))
+            add_support(spec, i, np.full(3, 0.5), np.array([0.0, 0.0, -5.0 - i]), np.asarray(_TILT))
         for i, name in enumerate(self.bodies):
             body = self._add_object(spec, name, np.array([0.0, 0.0, PARK_DEPTH - i]), np.array([1.0, 0, 0, 0]))
             body.mass, body.inertia = 0.1, [1e-4, 2e-4, 3e-4]
@@ -197,9 +197,9 @@ class SceneModel:
             for k in range(MAX_PARTS):
                 geom = dict(name=f"{name}_{k}", pos=[0.03, 0.01, 0.02], quat=_LEAN)
                 if self.cfg.slots == "mesh":
-                    _add_slot(body, type=mujoco.mjtGeom.mjGEOM_MESH, meshname="nothing", **geom)
+                    add_slot(body, type=mujoco.mjtGeom.mjGEOM_MESH, meshname="nothing", **geom)
                 else:
-                    _add_slot(body, type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1], **geom)
+                    add_slot(body, type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1], **geom)
         add_contact_sensors(spec, self.bodies[0], self.bodies[1:])
         return spec
 
@@ -228,8 +228,8 @@ class SceneModel:
             vertices, faces = part_mesh(part, self.cfg.sections)
             if part.type != MESH:  # the slot's pose places it, as it does the primitive
                 vertices = (vertices - np.asarray(part.pos)) @ quat_to_mat(np.asarray(part.quat))
-            _add_mesh(spec, f"part_{number}", vertices, faces)
-        _add_mesh(spec, "nothing", tetrahedron, np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]))
+            add_mesh(spec, f"part_{number}", vertices, faces)
+        add_mesh(spec, "nothing", tetrahedron, np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]))
 
     def _part(self, o: int, k: int) -> Part:
         objects = self.objects
@@ -253,9 +253,9 @@ class SceneModel:
             part = self._part(o, int(k))
             geom = dict(name=f"{name}_{k}", pos=part.pos, quat=part.quat, rgba=[*self.objects.rgb[o], 1.0])
             if self._mesh_of[o, k] >= 0:
-                _add_slot(body, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part_{self._mesh_of[o, k]}", **geom)
+                add_slot(body, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part_{self._mesh_of[o, k]}", **geom)
             else:
-                _add_slot(body, type=mujoco.mjtGeom(part.type), size=part.size, **geom)
+                add_slot(body, type=mujoco.mjtGeom(part.type), size=part.size, **geom)
 
     def compile_scene(self, bank: SceneBank, scene: int) -> mujoco.MjModel:
         """One scene compiled on its own, as the template with that scene loaded behaves (oracle, viewer and export)."""
@@ -265,7 +265,7 @@ class SceneModel:
         """The spec of one scene with only the bodies and geoms that it has; `key("start")` is its start state."""
         spec = self._base_spec()
         for i in range(int(bank.support_count[scene])):
-            geom = _add_support(
+            geom = add_support(
                 spec, i, bank.support_size[scene, i], bank.support_pos[scene, i], bank.support_quat[scene, i]
             )
             geom.rgba = [*bank.support_rgb[scene], 1.0]
@@ -291,7 +291,7 @@ class SceneModel:
         for o in range(len(self.objects)):
             self._add_parts(spec.worldbody.add_body(name=f"o{o}"), f"o{o}", o)
         nothing = spec.worldbody.add_body(name="empty")
-        _add_slot(nothing, name="nothing", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="nothing")
+        add_slot(nothing, name="nothing", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="nothing")
         model = spec.compile()
         used = self.objects.slot_type >= 0
         native = self.cfg.slots == "native"
@@ -317,41 +317,3 @@ def _mesh_numbers(objects: ObjectSet, slots: str) -> np.ndarray:
     """[O,8] number of the mesh asset that a slot uses, -1 for primitives."""
     used = objects.slot_type >= 0 if slots == "mesh" else objects.slot_type == MESH
     return np.where(used, np.cumsum(used.ravel()).reshape(used.shape) - 1, -1)
-
-
-def _compile_with_hulls(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a spec so that every mesh has its collision hull, used by a geom or not.
-
-    MuJoCo builds hulls for the meshes of colliding geoms only, once: a first compilation has a geom of every mesh.
-    """
-    library = spec.worldbody.add_body(name="library")
-    for mesh in spec.meshes:
-        library.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, contype=OBJECT_BIT)
-    spec.compile()
-    spec.delete(library)
-    model = spec.compile()
-    if (model.mesh_graphadr < 0).any():
-        raise RuntimeError("MuJoCo built no collision hull for some object meshes: the scene model needs MuJoCo 3.14")
-    return model
-
-
-def _add_mesh(spec: mujoco.MjSpec, name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
-    spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
-
-
-def _add_support(spec: mujoco.MjSpec, i: int, size: np.ndarray, pos: np.ndarray, quat: np.ndarray) -> mujoco.MjsGeom:
-    return spec.worldbody.add_geom(
-        name=f"support_{i}",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=size,
-        pos=pos,
-        quat=quat,
-        contype=STATIC_BIT,
-        conaffinity=0,
-        rgba=[0.65, 0.55, 0.45, 1.0],
-    )
-
-
-def _add_slot(body: mujoco.MjsBody, **geom: Any) -> None:
-    # Priority: the object's friction and contact parameters decide every contact it takes part in.
-    body.add_geom(contype=OBJECT_BIT, conaffinity=EVERYTHING, priority=1, mass=0.0, **geom)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from wbm.robot.facts import quat_to_mat
+from wbm.robot.rotations import quat_to_mat
 from wbm.scenes.parts import (
     IDENTITY,
     MAX_PARTS,

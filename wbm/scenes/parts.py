@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from wbm.robot.facts import quat_to_mat
+from wbm.robot.rotations import quat_to_mat
 
 SPHERE, CAPSULE, CYLINDER, BOX, MESH = 2, 3, 5, 6, 7
 MAX_PARTS = 8

@@ -6,8 +6,9 @@ import numpy as np
 
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
+from wbm.robot.rotations import multiply, rotate
 from wbm.robot.spheres import robot_spheres, self_pairs, sphere_positions
-from wbm.scenes.bank import NUM_SUPPORTS, SIDE, TOP_DOWN, multiply, rotate
+from wbm.scenes.bank import NUM_SUPPORTS, SIDE, TOP_DOWN
 from wbm.scenes.config import KINDS, ScenesConfig
 from wbm.scenes.instructions import NUM_HELD_OUT, NUM_TRAINING
 from wbm.scenes.layout import Layout, draw_layout

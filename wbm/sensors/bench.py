@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.model import load_robot
+from wbm.robot.rotations import quat_to_mat
 from wbm.scenes.bank import SceneBank
 from wbm.scenes.objects import ObjectSet
 from wbm.sensors import bench_peers

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import trimesh
 
-from wbm.robot.facts import quat_to_mat
+from wbm.robot.rotations import quat_to_mat
 from wbm.sensors.oracle import MujocoScene
 from wbm.sensors.ray_sensor import RaySensor
 from wbm.sensors.scene import BOX, CAPSULE, CYLINDER, PLANE, SPHERE

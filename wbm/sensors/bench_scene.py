@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from wbm.robot.facts import quat_to_mat
 from wbm.robot.model import forward_kinematics, load_robot
-from wbm.sensors.poses import look_at, mat_to_quat
+from wbm.robot.rotations import mat_to_quat, quat_to_mat
+from wbm.sensors.poses import look_at
 from wbm.sensors.scene import (
     BOX,
     CAPSULE,

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from wbm.kernels.noise_delay import pass_frame, pass_frame_bytes, plan_delivery, restart_delivery
+from wbm.kernels.noise_delay import PASS_FRAME, plan_delivery, restart_delivery
 from wbm.sensors.config import DelayConfig
 
 
@@ -73,7 +73,7 @@ class FrameDelay:
             # A CPU thread takes a whole row, which spares the cost of starting a thread a word.
             chunk = max(source.shape[1], 1) if device.is_cpu else 1
             wp.launch(
-                pass_frame if ring.dtype is wp.uint32 else pass_frame_bytes,
+                PASS_FRAME[ring.dtype],
                 dim=(env_ids.shape[0], -(-source.shape[1] // chunk)),
                 inputs=[env_ids, self._write, self._read, chunk, source, ring],
                 outputs=[out],

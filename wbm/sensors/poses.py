@@ -4,18 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-
-def mat_to_quat(m: np.ndarray) -> np.ndarray:
-    """Quaternion [4] (w x y z) of a rotation matrix [3,3], by its largest squared component (Shepperd, 1978)."""
-    k = int(np.argmax([np.trace(m), *np.diag(m)])) - 1
-    q = np.empty(4)
-    if k < 0:
-        q[:] = 1 + np.trace(m), m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    else:
-        i, j, n = k, (k + 1) % 3, (k + 2) % 3
-        q[0] = m[n, j] - m[j, n]
-        q[1 + i], q[1 + j], q[1 + n] = 1 + m[i, i] - m[j, j] - m[n, n], m[j, i] + m[i, j], m[n, i] + m[i, n]
-    return q / np.linalg.norm(q)
+from wbm.robot.rotations import mat_to_quat
 
 
 def look_at(pos: np.ndarray, target: np.ndarray) -> np.ndarray:
