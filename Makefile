@@ -70,7 +70,7 @@ wheel-test: dist
 	$(PYTHON) -m venv build/wheel/venv
 	$(call install_torch,build/wheel/venv/bin/pip)
 	build/wheel/venv/bin/pip install --quiet -c constraints.txt dist/*.whl
-	cd build/wheel && venv/bin/wbm doctor && venv/bin/wbm plan && venv/bin/wbm run --until prepare-assets
+	cd build/wheel && venv/bin/wbm doctor && venv/bin/wbm plan && venv/bin/wbm run
 	$(PYTHON) -m venv build/wheel/robot
 	build/wheel/robot/bin/pip install --quiet -c constraints.txt numpy onnxruntime
 	build/wheel/robot/bin/pip install --quiet --no-deps dist/*.whl
