@@ -43,6 +43,10 @@ class StepField:
         return (count + 7) // 8 if self.stored == "bits" else count * np.dtype(self.stored).itemsize
 
 
+STARTS = ("full", "pregrasp", "scattered")
+"""How an episode starts: from the scene's start pose, at a pre-grasp, or somewhere on the way, off the usual path."""
+
+
 @dataclass(frozen=True)
 class EpisodeInfo:
     """What is known of a whole episode.
@@ -55,7 +59,7 @@ class EpisodeInfo:
         object: object id.
         teacher: name of the teacher that was routed to.
         noise: factor of the noise injected into what was executed; 0 for none.
-        start: "full" or "pregrasp".
+        start: one of `STARTS`.
         success: whether the episode ended in success.
         seed: that the episode can be made again from.
     """

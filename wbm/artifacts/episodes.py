@@ -20,7 +20,15 @@ import numpy as np
 import zarr
 from zarr.codecs import TransposeCodec, ZstdCodec
 
-from wbm.artifacts.episode_layout import CHUNK_STEPS, FORMAT_VERSION, SHARD_STEPS, TEXT_FIELD, EpisodeInfo, StepLayout
+from wbm.artifacts.episode_layout import (
+    CHUNK_STEPS,
+    FORMAT_VERSION,
+    SHARD_STEPS,
+    STARTS,
+    TEXT_FIELD,
+    EpisodeInfo,
+    StepLayout,
+)
 
 
 class EpisodeWriter:
@@ -100,8 +108,8 @@ class EpisodeWriter:
         missing = [name for name in meta if name not in episode]
         if missing:
             raise ValueError(f"episode field {missing[0]!r} is missing")
-        if episode["start"] not in ("full", "pregrasp"):
-            raise ValueError(f"episode start is {episode['start']!r}, expected 'full' or 'pregrasp'")
+        if episode["start"] not in STARTS:
+            raise ValueError(f"episode start is {episode['start']!r}, expected one of {', '.join(STARTS)}")
         rows = self._layout.pack({f.name: episode[f.name] for f in self._layout.fields if f.name in episode})
         if not len(rows):
             raise ValueError("an episode must have at least one step")

@@ -71,6 +71,7 @@ class RewardConfig:
         overshoot_height, overshoot_width: the lift term decays above this height, m.
         drift_free, drift_width: it decays too beyond this horizontal distance from the settled place, m.
         hold: weight of holding the object above the success height inside the stability term.
+        hold_speed, hold_turn: speeds in the world at which that has decayed, m/s and rad/s.
         slip_speed, spin_speed: speeds relative to the hand at which the stability term has decayed, m/s and rad/s.
         support_force: hand force on supports and distractors that counts as one collision unit, N.
         grip_force: finger force above which grip is penalised, N.
@@ -98,6 +99,8 @@ class RewardConfig:
     drift_free: float = 0.06
     drift_width: float = 0.08
     hold: float = 2.0
+    hold_speed: float = 0.4
+    hold_turn: float = 1.0
     slip_speed: float = 0.15
     spin_speed: float = 3.0
     support_force: float = 20.0
@@ -105,6 +108,7 @@ class RewardConfig:
 
     def __post_init__(self) -> None:
         lengths = ("reach_length", "reach_far_length", "goal_width", "overshoot_width", "drift_width")
+        lengths += ("hold_speed", "hold_turn")
         for name in (*lengths, "slip_speed", "spin_speed", "support_force"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"env.reward.{name} must be positive, not {getattr(self, name)}")
@@ -153,15 +157,42 @@ class RandomizationConfig:
 
 
 @dataclass(frozen=True)
+class ScatterConfig:
+    """Starts anywhere between the start pose and the pre-grasp, off the usual path, for demonstrations of the way back.
+
+    Attributes:
+        per_scene: such starts kept for each scene.
+        base: largest offset of the base along x and y, m.
+        yaw: largest offset of its heading, rad.
+        arm: largest offset of each arm joint, rad.
+        neck: largest offset of each neck joint, rad.
+        clearance: least distance from everything, m.
+    """
+
+    per_scene: int = 6
+    base: float = 0.2
+    yaw: float = 0.4
+    arm: float = 0.5
+    neck: float = 0.3
+    clearance: float = 0.025
+
+    def __post_init__(self) -> None:
+        if self.per_scene < 1 or min(self.base, self.yaw, self.arm, self.neck, self.clearance) < 0:
+            raise ValueError("env.scatter: per_scene must be at least 1, and no offset negative")
+
+
+@dataclass(frozen=True)
 class EnvConfig:
     """A grasping environment.
 
     Attributes:
         start: `local` (at a pre-grasp) or `whole_body` (away from the support).
         pregrasp_share: share of whole-body episodes that start at the pre-grasp all the same.
+        scatter_share: share of whole-body episodes that start scattered, see `scatter`.
         episode_s: length of the contact-rich phase, s.
         approach_s: time allowed for the approach in whole-body episodes, s.
         approach_speed: speed of the end-effector target on its way to the pre-grasp, m/s.
+        approach_rate: it slows down to this times the distance left, 1/s.
         approach_turn: the same for rotation, rad/s.
         approach_leash: how far the target may run ahead of the hand, m.
         approach_back: the way leads over a point this far behind the pre-grasp against the approach direction, m.
@@ -180,13 +211,16 @@ class EnvConfig:
         starts_per_scene: pre-grasp solutions kept for each scene.
         observe: `privileged` (the teacher always knows the target's pose) or `seen` (only while the camera sees it).
         seen: what `observe=seen` means.
+        scatter: where scattered episodes start.
     """
 
     start: str = "local"
     pregrasp_share: float = 0.0
+    scatter_share: float = 0.0
     episode_s: float = 3.6
     approach_s: float = 6.0
     approach_speed: float = 0.5
+    approach_rate: float = 4.0
     approach_turn: float = 1.5
     approach_leash: float = 0.15
     approach_back: float = 0.12
@@ -205,6 +239,7 @@ class EnvConfig:
     starts_per_scene: int = 8
     observe: str = "privileged"
     seen: SeenConfig = field(default_factory=SeenConfig)
+    scatter: ScatterConfig = field(default_factory=ScatterConfig)
     action: ActionConfig = field(default_factory=ActionConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
@@ -214,8 +249,13 @@ class EnvConfig:
             raise ValueError(f"env.start is {self.start!r}; choose local or whole_body")
         if self.observe not in ("privileged", "seen"):
             raise ValueError(f"env.observe is {self.observe!r}; choose privileged or seen")
-        if not 0.0 <= self.pregrasp_share <= 1.0:
-            raise ValueError(f"env.pregrasp_share must be within 0 and 1, not {self.pregrasp_share}")
+        if min(self.pregrasp_share, self.scatter_share) < 0.0 or self.pregrasp_share + self.scatter_share > 1.0:
+            raise ValueError(
+                "env.pregrasp_share and env.scatter_share must be within 0 and 1 together, not "
+                f"{self.pregrasp_share} and {self.scatter_share}"
+            )
+        if self.approach_rate <= 0:
+            raise ValueError(f"env.approach_rate must be positive, not {self.approach_rate}")
         if self.episode_s <= self.success_hold_s:
             raise ValueError(f"env.episode_s ({self.episode_s}) must exceed env.success_hold_s ({self.success_hold_s})")
         if 0 < self.finish_s < self.success_hold_s:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wbm.envs.grasp_env import GraspEnv
+from wbm.envs.grasp_env import STARTS, GraspEnv
 from wbm.envs.outcome import REASONS, SUCCESS
 from wbm.envs.perception import MIN_TARGET_PIXELS, Perception, Sight, joint_limits
 from wbm.robot import joints
@@ -69,7 +69,7 @@ class Record:
     target_visible: float | None
     time_to_grasp_s: float | None
     max_force: float
-    near: bool
+    start: str
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -124,6 +124,8 @@ class EpisodeRunner:
         perception: what the student sees; None where nobody looks.
         kinds: scene kind [K] of each scene of the environment's bank; objects: target's index [K].
         text: embedding of each scene's instruction [K,D]; needed with perception.
+        noise: what is added to the executed targets, given episodes [K] and steps T: [K,T,32].
+        free_noise: factor of the noise in free space.
     """
 
     def __init__(
@@ -135,10 +137,11 @@ class EpisodeRunner:
         perception: Perception | None = None,
         text: Tensor | None = None,
         noise: Callable[[np.ndarray, int], np.ndarray] | None = None,
+        free_noise: float = 1.0,
     ) -> None:
         self.env, self.schema, self.perception, self.text = env, schema, perception, text
         self.kinds, self.objects = kinds, objects
-        self.noise = noise
+        self.noise, self.free_noise = noise, free_noise
         n, device = env.num_envs, env.device
         self._previous = torch.zeros(n, joints.NUM_JOINTS, device=device)
         self._noise = torch.zeros(0, n, joints.NUM_JOINTS, device=device)
@@ -205,13 +208,14 @@ class EpisodeRunner:
         env, s = self.env, self.env.state
         q, poses = s.q.float().clone(), env.object_poses().float().clone()
         episode, elapsed, phase = env.episode.clone(), env.elapsed.clone(), env.phase.clone()
-        distance, scene, near = s.centre_gap.clone(), env.scene.clone(), env.started_near.clone()
+        distance, scene, started = s.centre_gap.clone(), env.scene.clone(), env.started.clone()
         sight = None
         if self.perception:
             sight = self.perception.observe(q, s.qd.float(), poses, self._previous, elapsed)
         env.noise = None
         if self.noise:
-            env.noise = self._noise[elapsed.clamp(max=len(self._noise) - 1), torch.arange(env.num_envs)]
+            noise = self._noise[elapsed.clamp(max=len(self._noise) - 1), torch.arange(env.num_envs)]
+            env.noise = noise * torch.where(phase == 0, self.free_noise, 1.0).unsqueeze(1)
         _, _, done, info = driver.step(env, sight)
         command = info["ctrl"].float()
         action = to_increment(torch, q, command, self.schema.action)
@@ -220,7 +224,7 @@ class EpisodeRunner:
         self._previous.copy_(executed)
         ended = info["ended"]
         self._count(sight, elapsed, ended)
-        self._scene_of_done, self._near = scene, near
+        self._scene_of_done, self._started = scene, started
         self._code = info["outcome"]
         return Frame(episode, elapsed, q, poses, sight, action, executed, phase, distance, ended["held"], done, scene)
 
@@ -255,5 +259,5 @@ class EpisodeRunner:
             target_visible=float(t["seen"][e]) / looked if looked > 0 else None,
             time_to_grasp_s=step * self.env.period if step >= 0 else None,
             max_force=float(t["force"][e]),
-            near=bool(self._near[e]),
+            start=STARTS[int(self._started[e])],
         )

@@ -27,6 +27,9 @@ from wbm.robot.model import RobotModel
 from wbm.sim.config import SimConfig
 from wbm.sim.simulation import make_simulation
 
+STARTS = ("full", "pregrasp", "scattered")
+FULL, AT_PREGRASP, SCATTERED = range(3)
+
 _LIVE = ("episode", "scene", "scene_weight", "elapsed", "ctrl", "previous", "posture")
 
 
@@ -42,7 +45,7 @@ class GraspEnv:
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
         phase: 0 free space, 1 contact-rich [N].
-        started_near: episodes that started at the pre-grasp [N].
+        started: how each episode started [N], an index into `STARTS`.
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
         claim: given how many episodes start here, how many start before them in other processes and how many in all.
         scene_weight: relative chance of every scene [S] to be drawn; equal until a curriculum changes it.
@@ -86,7 +89,7 @@ class GraspEnv:
         self.next_episode = 0
         self.claim: Callable[[int], tuple[int, int]] = lambda count: (0, count)
         self.phase = torch.ones(num_envs, dtype=torch.uint8, device=device)
-        self.started_near = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.started = torch.full((num_envs,), AT_PREGRASP, dtype=torch.int64, device=device)
 
     @property
     def limit_steps(self) -> int:

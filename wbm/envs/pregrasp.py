@@ -14,7 +14,7 @@ from wbm.control.planner import Target, pregrasp_poses
 from wbm.control.wbc import WholeBodyController
 from wbm.envs.actions import HAND_OPEN
 from wbm.envs.binding import SceneTable
-from wbm.envs.config import EnvConfig
+from wbm.envs.config import EnvConfig, ScatterConfig
 from wbm.envs.draws import Columns, episode_uniforms
 from wbm.envs.randomization import scaled
 from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
@@ -32,13 +32,15 @@ class StartBank:
     The first of a scene is the planner's own: straight ahead and in the middle, so that it follows from what can be
     seen, or, where that is out of reach or short of room, the one with the most room. The others are spread around it.
 
-    `clearance` [S] is the largest distance from everything among a scene's starts, m, -inf without one.
+    `clearance` [S] is the largest distance from everything among a scene's starts, m, -inf without one. `scattered`
+    [S,P,32] are starts off the way to the pre-grasp, where they were asked for.
     A scene without a reachable pre-grasp has a count of 0; `draw` must not be asked for it.
     """
 
     q: Tensor
     count: Tensor
     clearance: Tensor = field(default_factory=lambda: torch.zeros(0))
+    scattered: Tensor = field(default_factory=lambda: torch.zeros(0, 0, joints.NUM_JOINTS))
 
     def draw(self, scenes: Tensor, uniform: Tensor) -> Tensor:
         """One start [K,32] for each of `scenes` [K], picked by `uniform` [K] in [0, 1)."""
@@ -145,6 +147,51 @@ def stand_poses(base: Tensor, u: Tensor) -> Tensor:
     return torch.stack([x, y, base[:, 2] + offset[:, 2]], -1)
 
 
+def scatter_starts(
+    table: SceneTable,
+    robot: RobotModel,
+    wbc_cfg: WbcConfig,
+    cfg: ScatterConfig,
+    goal: Tensor,
+    seed: int = 0,
+    device: str = "cpu",
+    batch: int = 512,
+    rounds: int = 12,
+) -> Tensor:
+    """Starts between the scenes' start poses and `goal` [S,32], offset at random and clear of everything: [S,P,32].
+
+    A start that could not be placed within `rounds` is the scene's own start pose.
+    """
+    everything = torch.arange(table.count, device=device)
+    out = table.q_start.unsqueeze(1).repeat(1, cfg.per_scene, 1)
+    batch = min(batch, table.count)
+    solver = _Solver(table, robot, wbc_cfg, batch, device)
+    offset = torch.zeros(joints.NUM_JOINTS, device=device)
+    offset[:2], offset[2], offset[joints.ARM], offset[joints.NECK] = cfg.base, cfg.yaw, cfg.arm, cfg.neck
+    low = torch.tensor(robot.q_min, dtype=torch.float32, device=device)
+    high = torch.tensor(robot.q_max, dtype=torch.float32, device=device)
+    columns, tried = Columns(), 0
+    along, aside = columns.add("along"), columns.add("aside", joints.NUM_JOINTS)
+    for place in range(cfg.per_scene):
+        waiting = everything
+        for _ in range(rounds):
+            left = []
+            for part in waiting.split(batch):
+                u = episode_uniforms(seed, np.arange(tried, tried + len(part)), columns.count)
+                u = torch.from_numpy(u).to(device)
+                tried += len(part)
+                way = table.q_start[part] + u[:, along] * (goal[part] - table.q_start[part])
+                q = (way + offset * (2.0 * u[:, aside] - 1.0)).clamp(low, high)
+                q[:, joints.HAND] = goal[part][:, joints.HAND]
+                free = solver.clearance(part, q) > cfg.clearance
+                out[part[free], place] = q[free]
+                left.append(part[~free])
+            waiting = torch.cat(left)
+            if len(waiting) == 0:
+                break
+    return out
+
+
 class _Solver:
     """Runs the controller on a batch of candidates without physics."""
 
@@ -168,11 +215,7 @@ class _Solver:
     def solve(self, scenes: Tensor, pos: Tensor, quat: Tensor, base: Tensor, iterations: int) -> tuple[Tensor, ...]:
         """Joint positions [B,32], which of them are good [B], and their distance from everything [B], m."""
         t, size = self.table, len(scenes)
-        pad = torch.arange(self.batch, device=scenes.device) % size
-        for live, values in zip(
-            self.obstacles, (t.obstacle_type, t.obstacle_size, t.obstacle_pos, t.obstacle_quat), strict=True
-        ):
-            live.copy_(values[scenes[pad]])
+        pad = self._show(scenes)
         self.q.copy_(self.home)
         self.q[:, joints.BASE] = base[pad]
         self.pos.copy_(pos[pad])
@@ -188,3 +231,20 @@ class _Solver:
         angle = quat_log(quat_mul(quat_conj(self.frame_quat[:, self.ee]), self.quat)).norm(dim=-1)
         good = (error < 0.02) & (angle < 0.15) & (self.distance > 0.005)
         return self.q[:size].clone(), good[:size].clone(), self.distance[:size].clone()
+
+    def clearance(self, scenes: Tensor, q: Tensor) -> Tensor:
+        """Distance [B] of joints `q` [B,32] from everything in their scenes and from themselves, m."""
+        self.q.copy_(q[self._show(scenes)])
+        self.controller.reset(torch.arange(self.batch, device=scenes.device))  # pyright: ignore[reportArgumentType]
+        self.controller.step()
+        return self.distance[: len(scenes)].clone()
+
+    def _show(self, scenes: Tensor) -> Tensor:
+        """Place the obstacles of `scenes` [B]; which of them each of the batch's places shows."""
+        t = self.table
+        pad = torch.arange(self.batch, device=scenes.device) % len(scenes)
+        for live, values in zip(
+            self.obstacles, (t.obstacle_type, t.obstacle_size, t.obstacle_pos, t.obstacle_quat), strict=True
+        ):
+            live.copy_(values[scenes[pad]])
+        return pad

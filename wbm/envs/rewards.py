@@ -45,9 +45,10 @@ def lift(s: GraspState, c: RewardConfig) -> Tensor:
 
 
 def stable(s: GraspState, c: RewardConfig) -> Tensor:
-    """After lift-off: no slip, no spin, contact kept; and holding above the success height."""
+    """After lift-off: no slip, no spin, contact kept; and holding still above the success height."""
     calm = torch.exp(-s.slip / c.slip_speed - s.spin / c.spin_speed)
-    return s.lifted * (s.held * calm - (1 - s.held)) + c.hold * s.holding
+    still = torch.exp(-s.obj_lin_vel_w.norm(dim=-1) / c.hold_speed - s.obj_ang_vel_w.norm(dim=-1) / c.hold_turn)
+    return s.lifted * (s.held * calm - (1 - s.held)) + c.hold * s.holding * still
 
 
 def col(s: GraspState, c: RewardConfig) -> Tensor:

@@ -14,18 +14,22 @@ class NoiseConfig:
         innovation: share of the scale that enters in a step.
         scale: base, arm, hand and neck joints, m or rad.
         levels: an episode's noise is one of these factors of the scale, drawn uniformly.
+        free: further factor in free space, where larger errors than in contact can be mended.
     """
 
     correlation: float = 0.85
     innovation: float = 0.25
     scale: tuple[float, float, float, float] = (0.012, 0.03, 0.06, 0.02)
     levels: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5)
+    free: float = 2.5
 
     def __post_init__(self) -> None:
         if not 0 <= self.correlation < 1:
             raise ValueError(f"rollouts.noise.correlation must be in [0, 1), not {self.correlation}")
-        if not self.levels or min(self.levels) < 0:
-            raise ValueError("rollouts.noise.levels needs at least one factor, none negative")
+        if not self.levels or min(*self.levels, self.free, 0.0) < 0:
+            raise ValueError(
+                "rollouts.noise: levels needs a factor, and neither it nor free may be negative"
+            )
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,7 @@ class RolloutsConfig:
         num_envs: environments that run side by side in a process.
         workers: processes; does not change the result.
         pregrasp_share: share of the episodes that start at the pre-grasp.
+        scatter_share: share that starts off the usual path, so that the student learns the way back (`env.scatter`).
         keep: `successes`, or `all` for a short pipeline whose teacher has hardly learned.
         physics: `evaluate` (fine physics) or `train` (the physics that teachers learn in, faster).
         seed_offset: added to the seed, so that rollouts never repeat the episodes of training or evaluation.
@@ -49,7 +54,8 @@ class RolloutsConfig:
     episodes: int = 96
     num_envs: int = 48
     workers: int = field(default=2, metadata={"key": False})
-    pregrasp_share: float = 0.3
+    pregrasp_share: float = 0.2
+    scatter_share: float = 0.4
     keep: str = "successes"
     physics: str = "evaluate"
     seed_offset: int = 10_000
@@ -63,5 +69,8 @@ class RolloutsConfig:
             raise ValueError(f"rollouts.keep={self.keep}: use successes or all")
         if self.physics not in ("evaluate", "train"):
             raise ValueError(f"rollouts.physics={self.physics}: use evaluate or train")
-        if not 0 <= self.pregrasp_share <= 1:
-            raise ValueError(f"rollouts.pregrasp_share must be in [0, 1], not {self.pregrasp_share}")
+        if min(self.pregrasp_share, self.scatter_share) < 0 or self.pregrasp_share + self.scatter_share > 1:
+            raise ValueError(
+                "rollouts.pregrasp_share and rollouts.scatter_share must be in [0, 1] together, not "
+                f"{self.pregrasp_share} and {self.scatter_share}"
+            )

@@ -45,7 +45,7 @@ class SeenEnv(WholeBodyEnv):
         own |= {name: getattr(self, name) for name in self._EPISODE}
         return super()._live() | own
 
-    _EPISODE = ("phase", "started_near", "_contact_since", "_close_since", "_goal_q", "_goal_pos",
+    _EPISODE = ("phase", "started", "_contact_since", "_close_since", "_goal_q", "_goal_pos",
                 "_goal_quat", "_start_q", "_settled_goal", "_corner", "_corners", "_corner_at")  # fmt: skip
 
     def _plan(self, ids: Tensor, scenes: Tensor, start: Tensor, goal: Tensor) -> None:

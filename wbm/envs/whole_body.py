@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from wbm.control.base_path import BaseMap, Obstacles, base_path
-from wbm.envs.grasp_env import GraspEnv
+from wbm.envs.grasp_env import AT_PREGRASP, FULL, SCATTERED, GraspEnv
 from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
 from wbm.robot import joints
 
@@ -47,7 +47,7 @@ class WholeBodyEnv(GraspEnv):
         """Arguments as `GraspEnv`."""
         super().__init__(*args, **kwargs)
         n, device = self.num_envs, self.device
-        self._near = self.columns.add("near")
+        self._near, self._scatter = self.columns.add("near"), self.columns.add("scatter")
         self._contact_since, self._close_since = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(2))
         self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
         self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
@@ -71,10 +71,16 @@ class WholeBodyEnv(GraspEnv):
         near = u[:, self._near].squeeze(1) < self.cfg.pregrasp_share
         own = self._fixed_neck(self.starts.first(scenes))
         goal = torch.where(near.unsqueeze(1), super()._start_joints(ids, scenes, u), own)
-        self._goal_q[ids], self.started_near[ids] = goal, near
+        self._goal_q[ids] = goal
+        scattered = ~near & (u[:, self._near].squeeze(1) < self.cfg.pregrasp_share + self.cfg.scatter_share)
+        self.started[ids] = torch.where(near, AT_PREGRASP, torch.where(scattered, SCATTERED, FULL))
         self.phase[ids] = torch.where(near, CONTACT, FREE).to(torch.uint8)
         self._contact_since[ids], self._close_since[ids] = 0, -1
         away = self.binding.table.q_start[scenes].to(goal)
+        if len(self.starts.scattered):
+            count = self.starts.scattered.shape[1]
+            pick = (u[:, self._scatter].squeeze(1) * count).long()
+            away = torch.where(scattered.unsqueeze(1), self.starts.scattered[scenes, pick], away)
         away[:, joints.HAND] = goal[:, joints.HAND]
         start = torch.where(near.unsqueeze(1), goal, away)
         self._corners[ids], self._corner_at[ids], self._start_q[ids] = 0, 0, start
@@ -162,7 +168,9 @@ class WholeBodyEnv(GraspEnv):
     def _approach(self, free: Tensor) -> None:
         """Lead the targets of the environments in free space towards waypoint and pre-grasp."""
         c, s, term = self.cfg, self.state, self.action
-        ahead = _towards(term.pos, self._waypoint(), c.approach_speed * self.period)
+        goal = self._waypoint()
+        speed = (c.approach_rate * (goal - term.pos).norm(dim=-1, keepdim=True)).clamp(max=c.approach_speed)
+        ahead = _towards(term.pos, goal, speed * self.period)
         ahead = s.ee_pos_w + _towards(torch.zeros_like(ahead), ahead - s.ee_pos_w, c.approach_leash)
         turn = quat_log(quat_mul(quat_conj(term.quat), self._goal_quat))
         turned = quat_mul(term.quat, quat_exp(_towards(torch.zeros_like(turn), turn, c.approach_turn * self.period)))
@@ -203,7 +211,7 @@ class WholeBodyEnv(GraspEnv):
             self.action.reset(hold, s.q[hold].float(), s.ee_pos_w[hold], s.ee_quat[hold])
 
 
-def _towards(start: Tensor, goal: Tensor, step: float) -> Tensor:
-    """Points [N,3] at most `step` from `start` on the way to `goal`."""
+def _towards(start: Tensor, goal: Tensor, step: float | Tensor) -> Tensor:
+    """Points [N,3] at most `step` (a number or [N,1]) from `start` on the way to `goal`."""
     delta = goal - start
     return start + delta * (step / delta.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)

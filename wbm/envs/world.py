@@ -12,7 +12,7 @@ from wbm.control.planner import AMPLE, GRASPS, PREFERENCE, choose_grasp, fits
 from wbm.envs.binding import SceneBinding
 from wbm.envs.config import EnvConfig
 from wbm.envs.grasp_env import GraspEnv
-from wbm.envs.pregrasp import StartBank, solve_starts, target_of
+from wbm.envs.pregrasp import StartBank, scatter_starts, solve_starts, target_of
 from wbm.envs.seen_env import SeenEnv
 from wbm.envs.whole_body import WholeBodyEnv
 from wbm.robot.config import MjcfOptions
@@ -79,6 +79,8 @@ def make_env(
     binding = SceneBinding(model, bank, rows[usable], device)
     kept = StartBank(starts.q[starts.usable], starts.count[starts.usable])
     env = cfg.env
+    if env.scatter_share > 0:
+        kept.scattered = scatter_starts(binding.table, model.robot, cfg.wbc, env.scatter, kept.q[:, 0], seed, device)
     kind = WholeBodyEnv if env.start == "whole_body" else GraspEnv
     if env.observe == "seen":
         kind, env = SeenEnv, env if env.start == "whole_body" else replace(env, pregrasp_share=1.0)
@@ -124,6 +126,7 @@ def find_starts(
     return StartBank(q[chosen, scenes], found[chosen, scenes], room[chosen, scenes]), chosen.cpu().numpy()
 
 
-def with_start(cfg: WorldConfig, start: str, pregrasp_share: float = 0.0) -> WorldConfig:
+def with_start(cfg: WorldConfig, start: str, pregrasp_share: float = 0.0, scatter_share: float = 0.0) -> WorldConfig:
     """The same world with another way of starting episodes."""
-    return replace(cfg, env=replace(cfg.env, start=start, pregrasp_share=pregrasp_share))
+    env = replace(cfg.env, start=start, pregrasp_share=pregrasp_share, scatter_share=scatter_share)
+    return replace(cfg, env=env)

@@ -121,7 +121,7 @@ class EvaluationWorld:
             "object": str(self.assets.objects.name[record.object_index]),
             "teacher": "none",
             "noise": 0.0,
-            "start": "pregrasp" if record.near else "full",
+            "start": record.start,
             "success": record.success,
             "seed": record.episode,
             "instructions": [str(self.assets.texts.sentence[r]) for r in row],

@@ -66,7 +66,7 @@ class RolloutWorld:
         self.job = job
         self.assets: Assets = load_assets(job.assets)
         suite = load_suite(job.teachers, job.device)
-        world = with_start(job.world, "whole_body", job.rollouts.pregrasp_share)
+        world = with_start(job.world, "whole_body", job.rollouts.pregrasp_share, job.rollouts.scatter_share)
         physics = EVALUATE if job.rollouts.physics == "evaluate" else world.sim
         world = replace(world, sim=replace(physics, engine=world.sim.engine, threads=1))
         rows = scene_rows(self.assets.scenes, "train", KINDS, tuple(g for g in GRASPS if g in suite))
@@ -95,6 +95,7 @@ class RolloutWorld:
             self.perception,
             texts.to(job.device),
             self.noise,
+            job.rollouts.noise.free,
         )
 
     def level(self, episode: int) -> float:
@@ -112,7 +113,7 @@ class RolloutWorld:
             "object": str(self.assets.objects.name[record.object_index]),
             "teacher": self.teacher.names().get(int(self.bank.approach[scene]), "none"),
             "noise": self.level(record.episode),
-            "start": "pregrasp" if record.near else "full",
+            "start": record.start,
             "success": record.success,
             "seed": record.episode,
             "instructions": [str(texts.sentence[r]) for r in rows],
@@ -128,7 +129,7 @@ def collect_shard(world: RolloutWorld, shard: int) -> ShardReport:
     recorder = Recorder(writer, world.describe, lambda r: r.success or cfg.keep == "all", world.env.period)
 
     def on_end(env: int, record: Record) -> None:
-        if not record.near and world.level(record.episode) == 0.0:
+        if record.start == "full" and world.level(record.episode) == 0.0:
             clean[KINDS[record.kind]][0] += int(record.success)
             clean[KINDS[record.kind]][1] += 1
         recorder.on_end(env, record)

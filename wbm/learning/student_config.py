@@ -22,7 +22,9 @@ class StudentConfig:
         lidar_tokens: tokens of the LiDAR cloud; 0 leaves the LiDAR out.
         chunk: actions predicted at once; the first is the one of now.
         local_radius: metres; points nearer than this describe a point's surroundings; 0 leaves them out.
-        use_prev_action: whether the action of the step before is an input.
+        use_prev_action: whether the action of the step before is an input. It foretells the next one so well that a
+            student given it learns to repeat it, and then never starts to move.
+        use_velocity: whether joint velocities are an input; they foretell the next action too.
         use_text: whether the instruction is.
         use_mask: whether the target mask is.
     """
@@ -37,7 +39,8 @@ class StudentConfig:
     lidar_tokens: int = 1
     chunk: int = 1
     local_radius: float = 0.06
-    use_prev_action: bool = True
+    use_prev_action: bool = False
+    use_velocity: bool = False
     use_text: bool = True
     use_mask: bool = True
 

@@ -18,6 +18,7 @@ from wbm.robot.schema import PROPRIO_LABELS, PolicySchema
 _FAR = -1e4  # a logit that softmax turns into 0 without infinities
 _EE_POS = PROPRIO_LABELS.index("ee_pos_b/x")
 _EE_ROT = PROPRIO_LABELS.index("ee_rot6d_b/0")
+_VELOCITIES = [label.startswith("qd/") for label in PROPRIO_LABELS]
 _LOCAL_CHANNELS = 13
 
 
@@ -111,6 +112,8 @@ class Tokenizer(nn.Module):
         self.register_buffer("proprio_std", torch.ones(num_proprio))
         self.register_buffer("prev_action_std", torch.ones(schema.action.size))
         self.register_buffer("centre_b", torch.zeros(3))
+        known = ~torch.tensor(_VELOCITIES) | cfg.use_velocity
+        self.register_buffer("known", known.float(), persistent=False)
         self.text_gain = float(schema.text_dim) ** 0.5
         self.text = nn.Linear(schema.text_dim, width)
         channels = 3 + 3 + 3 + 1 + (_LOCAL_CHANNELS if cfg.local_radius else 0)
@@ -168,7 +171,7 @@ class Tokenizer(nn.Module):
             scan_ee = ((scan - ee_pos) @ ee_rot) * scan_valid
             points = self.lidar(torch.cat([scan * scan_valid, scan_ee], dim=-1))
             tokens.append(self.scan(masked_max(points, scan_valid)).unflatten(1, (self.cfg.lidar_tokens, -1)))
-        state = (proprio - self.proprio_mean) / self.proprio_std
+        state = (proprio - self.proprio_mean) / self.proprio_std * self.known
         tokens.append(self.proprio(state).unflatten(1, (self.cfg.proprio_tokens, -1)))
         if self.prev_action is not None:
             tokens.append(self.prev_action(obs["prev_action"] / self.prev_action_std).unsqueeze(1))
