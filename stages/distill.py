@@ -1,14 +1,16 @@
-"""distill: train the student on rollouts."""
+"""distill: train the student on rollouts, and on what controller and teachers say to its own episodes (DAgger)."""
 
 from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 from typing import Any
 
 KIND = "student"
-SECTIONS = ("seed", "student", "distill")
-INPUTS = ("rollouts",)
+SECTIONS = ("seed", "student", "distill", "robot", "sim", "wbc", "sensors", "env", "rollouts")
+INPUTS = ("rollouts", "assets", "teacher/*")
+SHARD_EPISODES = 96
 
 
 def name(cfg: Any) -> str:
@@ -45,7 +47,10 @@ def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
             task.update(step - done, **figures)
             done = step
 
-        result = distill(paths, schema, cfg.student, settings, draft.scratch, report)
+        def collect(policy: Any, number: int) -> list[Path]:
+            return _collect(cfg, inputs, draft.scratch / f"round-{number}", policy, number)
+
+        result = distill(paths, schema, cfg.student, settings, draft.scratch, report, collect)
 
     # Publish
     save_student(draft.path, result.network, {"iterations": settings.total_iterations})
@@ -63,3 +68,28 @@ def run(cfg: Any, inputs: Any, draft: Any, progress: Any) -> None:
         "cpu_seconds": round(time.process_time() - started, 1),
     }
     draft.seeds["distill"] = settings.seed
+
+
+def _collect(cfg: Any, inputs: Any, folder: Path, policy: Any, number: int) -> list[Path]:
+    """Shards of a round of DAgger in `folder`; those that an interrupted run finished are kept."""
+    from dataclasses import replace
+
+    from stages.generate_rollouts import SHARDS, shard_job
+    from wbm.artifacts.episode_reader import shard_paths
+    from wbm.learning.dagger import RoundJob
+    from wbm.learning.student import save_student
+    from wbm.learning.workers import run_jobs
+
+    student, shards = folder / "student", folder / SHARDS
+    if not (folder / "done").exists():
+        save_student(student, policy.network)
+        shards.mkdir(parents=True, exist_ok=True)
+        count = -(-cfg.distill.dagger_episodes // SHARD_EPISODES)
+        each = replace(cfg.rollouts, episodes=-(-cfg.distill.dagger_episodes // count))
+        jobs = [RoundJob(shard_job(cfg, inputs, i, shards), student, number) for i in range(count)]
+        jobs = [replace(job, shard=replace(job.shard, rollouts=each)) for job in jobs]
+        waiting = [job for job in jobs if not (folder / f"{job.shard.shard}.done").exists()]
+        for done in run_jobs("wbm.learning.dagger", waiting, cfg.rollouts.workers):
+            (folder / f"{done}.done").touch()
+        (folder / "done").touch()
+    return shard_paths(shards)

@@ -36,7 +36,7 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     folder, reports = draft.path / SHARDS, draft.path / REPORTS
     reports.mkdir(parents=True, exist_ok=True)
     _take_parts(draft.path)
-    jobs = [_job(cfg, inputs, i, folder) for i in range(cfg.rollouts.shards)]
+    jobs = [shard_job(cfg, inputs, i, folder) for i in range(cfg.rollouts.shards)]
     # A shard is done when its report is on the disk, which is flushed after the shard; anything less is made again.
     waiting = [job for job in jobs if not _report(reports, job.shard).exists()]
     for job in waiting:
@@ -64,7 +64,7 @@ def make_parts(cfg: Any, inputs: dict[str, Any], places: dict[int, Path], worker
     """Make shards, each in a folder of its own with its report."""
     from wbm.learning.workers import run_jobs
 
-    jobs = [_job(cfg, inputs, number, place / SHARDS) for number, place in places.items()]
+    jobs = [shard_job(cfg, inputs, number, place / SHARDS) for number, place in places.items()]
     for report in run_jobs("wbm.learning.rollouts", jobs, workers):
         _write_report(places[report.shard] / REPORTS, report)
         yield report.shard
@@ -75,7 +75,8 @@ def uses_gpu(cfg: Any) -> bool:
     return cfg.sim.engine == "mujoco_warp"
 
 
-def _job(cfg: Any, inputs: dict[str, Any], shard: int, folder: Path) -> Any:
+def shard_job(cfg: Any, inputs: dict[str, Any], shard: int, folder: Path) -> Any:
+    """What a process needs to make shard `shard` in `folder`."""
     from wbm.envs.world import WorldConfig
     from wbm.learning.rollouts import ShardJob
     from wbm.sim.simulation import default_device

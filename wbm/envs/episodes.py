@@ -219,8 +219,7 @@ class EpisodeRunner:
         _, _, done, info = driver.step(env, sight)
         command = info["ctrl"].float()
         action = to_increment(torch, q, command, self.schema.action)
-        noisy = env.noise is not None
-        executed = to_increment(torch, q, command + env.noise, self.schema.action) if noisy else action
+        executed = to_increment(torch, q, info["executed"].float(), self.schema.action)
         self._previous.copy_(executed)
         ended = info["ended"]
         self._count(sight, elapsed, ended)

@@ -44,6 +44,7 @@ class GraspEnv:
         state: the present `GraspState`; known: what policy and gaze know of it, the same unless a subclass hides some.
         ctrl: joint targets that the last step commanded [N,32], before `noise`.
         noise: optional [N,32] added to what is executed (the command recorded in `ctrl` stays clean).
+        override: optional [N,32] executed in place of `ctrl`: another policy acts and this one is only asked.
         phase: 0 free space, 1 contact-rich [N].
         started: how each episode started [N], an index into `STARTS`.
         episode: episode number [N]; `scene`: scene index [N]; `elapsed`: steps since its start [N].
@@ -85,6 +86,7 @@ class GraspEnv:
         self.scene_weight = torch.ones(binding.table.count, dtype=torch.float64, device=device)
         self.ctrl = self.sim.ctrl.clone()
         self.noise: Tensor | None = None
+        self.override: Tensor | None = None
         self.previous = torch.zeros(num_envs, self.num_actions, device=device)
         self.next_episode = 0
         self.claim: Callable[[int], tuple[int, int]] = lambda count: (0, count)
@@ -217,8 +219,8 @@ class GraspEnv:
             `time_outs` [N] (ended by time alone), `outcome` [N] (see `outcome.REASONS`, `RUNNING` where it goes on),
             `terms` [N,8] weighted reward terms in the order of `rewards.TERMS`, `episode` and `scene` [N] that the step
             belonged to,
-            `ctrl` [N,32] clean joint targets, and `ended`, what the step led to before any restart: `held`, `height`,
-            `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
+            `ctrl` and `executed` [N,32] joint targets, clean and as carried out, and `ended`, what the step led to
+            before any restart: `held`, `height`, `force` (largest of a finger), `forbidden` [N], `object_z` [N,1+D].
         """
         action = action.clamp(-self.cfg.action.limit, self.cfg.action.limit)
         s = self.state
@@ -260,7 +262,9 @@ class GraspEnv:
         self._fix_neck()
 
     def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
-        self.sim.ctrl.copy_(self.ctrl if self.noise is None else self.ctrl + self.noise)
+        executed = self.ctrl if self.noise is None else self.ctrl + self.noise
+        executed = executed.clone() if self.override is None else self.override
+        self.sim.ctrl.copy_(executed)
         self.sim.step(self.decimation)
         self.elapsed += 1
         before = self.previous.clone()
@@ -274,7 +278,7 @@ class GraspEnv:
         reward = reward - self.cfg.reward.scale * self.cfg.reward.drop * (done & ~timed & (code != SUCCESS))
         reward[code == UNSTABLE] = 0.0
         info = {"time_outs": timed.float(), "outcome": code, "terms": terms, "episode": self.episode.clone()}
-        info |= {"scene": self.scene.clone(), "ctrl": self.ctrl.clone(), "ended": self._ended()}
+        info |= {"scene": self.scene.clone(), "ctrl": self.ctrl.clone(), "executed": executed, "ended": self._ended()}
         ids = done.nonzero().squeeze(1)
         episodes = self._claim(len(ids))
         if len(ids):

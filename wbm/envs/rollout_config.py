@@ -27,9 +27,7 @@ class NoiseConfig:
         if not 0 <= self.correlation < 1:
             raise ValueError(f"rollouts.noise.correlation must be in [0, 1), not {self.correlation}")
         if not self.levels or min(*self.levels, self.free, 0.0) < 0:
-            raise ValueError(
-                "rollouts.noise: levels needs a factor, and neither it nor free may be negative"
-            )
+            raise ValueError("rollouts.noise: levels needs a factor, and neither it nor free may be negative")
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,9 @@ NEAR_PREGRASP = (0.012, 0.08)  # m and rad at which the pre-grasp counts as reac
 GOOD_PREGRASP = (0.02, 0.15)  # and after `LINGER` s of trying, in whatever motion
 LINGER = 0.8
 CALM = (0.05, 0.15)  # m/s of the base and rad/s of arm joints that count as rest
+BEGUN = (0.05, 0.5)  # m and rad off the pre-grasp's line within which a hand that is ahead of it is at work
+LOST = 0.15  # m off the line or behind the pre-grasp from which it has to come anew
+TURN_AHEAD = 0.25  # s by which the target's orientation leads the hand
 MAX_CORNERS = 12
 NEAR_CORNER = 0.15  # m at which a corner of the base's way counts as passed
 CARROT = 1.0  # m ahead of the base at which its target moves along the way
@@ -131,6 +134,40 @@ class WholeBodyEnv(GraspEnv):
         self._command()
         return self._advance(action)
 
+    def resume(self, which: Tensor) -> None:
+        """Go on in environments `which` [N] as if what was executed had been this environment's own commands.
+
+        Where noise was added, or another policy acted, the memories of the controller and of the action term hold what
+        they would have done. Here the controller starts from the measured joints, and the targets of hand and fingers
+        are those that were executed, so that the next command follows from the present state alone.
+        """
+        s, c, row = self.state, self._controller_state, which.unsqueeze(1)
+        executed = self.sim.ctrl[:, : joints.NUM_JOINTS].float()
+        # The command leads the new target by the actuators' delay; the target must not lead the joints by a step more.
+        q, qd = s.q[:, self._body].float(), s.qd[:, self._body].float()
+        c["q_target"].copy_(torch.where(row, q - self.controller.cfg.dt * qd, c["q_target"]))
+        c["qd"].copy_(torch.where(row, qd, c["qd"]))
+        self.q_in.copy_(executed)
+        self.controller.forward_kinematics()
+        at, term = self.reader.ee, self.action
+        term.pos.copy_(torch.where(row, self.frame_pos[:, at], term.pos))
+        term.quat.copy_(torch.where(row, self.frame_quat[:, at], term.quat))
+        term.hand.target.copy_(torch.where(row, executed[:, joints.HAND], term.hand.target))
+        self.ctrl[:, joints.HAND] = torch.where(row, executed[:, joints.HAND], self.ctrl[:, joints.HAND].float())
+        self._refresh()
+
+    def find_phase(self) -> None:
+        """Set the phase by where the hand is, for episodes in which another policy acts and nobody kept track of it."""
+        s = self.state
+        off = rotate(quat_conj(self._goal_quat), s.ee_pos_w - self._goal_pos)
+        aside, ahead = off[:, :2].norm(dim=-1), off[:, 2]
+        _, angle = self._errors(self._goal_pos, self._goal_quat)
+        lost = (s.lifted == 0) & ((ahead < -LOST) | (aside > LOST))
+        begun = (ahead > -GOOD_PREGRASP[0]) & (aside < BEGUN[0]) & (angle < BEGUN[1]) & (self.phase == FREE) & ~lost
+        self._contact_since[begun] = self.elapsed[begun]
+        self.posture[begun] = s.q[begun][:, self._body].to(self.posture)
+        self.phase[begun], self.phase[lost] = CONTACT, FREE
+
     def _errors(self, pos: Tensor, quat: Tensor) -> tuple[Tensor, Tensor]:
         s = self.state
         turn = quat_log(quat_mul(quat_conj(s.ee_quat), quat))
@@ -172,8 +209,8 @@ class WholeBodyEnv(GraspEnv):
         speed = (c.approach_rate * (goal - term.pos).norm(dim=-1, keepdim=True)).clamp(max=c.approach_speed)
         ahead = _towards(term.pos, goal, speed * self.period)
         ahead = s.ee_pos_w + _towards(torch.zeros_like(ahead), ahead - s.ee_pos_w, c.approach_leash)
-        turn = quat_log(quat_mul(quat_conj(term.quat), self._goal_quat))
-        turned = quat_mul(term.quat, quat_exp(_towards(torch.zeros_like(turn), turn, c.approach_turn * self.period)))
+        turn = quat_log(quat_mul(quat_conj(s.ee_quat), self._goal_quat))
+        turned = quat_mul(s.ee_quat, quat_exp(_towards(torch.zeros_like(turn), turn, c.approach_turn * TURN_AHEAD)))
         keep = (~free).unsqueeze(1)
         term.velocity.copy_(torch.where(keep, term.velocity, (ahead - term.pos) / self.period))
         term.pos.copy_(torch.where(keep, term.pos, ahead))

@@ -12,8 +12,9 @@ import torch
 
 from wbm.artifacts.episodes import EpisodeWriter
 from wbm.envs.collect import Recorder, injected_noise, noise_level
-from wbm.envs.episodes import EpisodeRunner, Record, TeacherDriver
+from wbm.envs.episodes import EpisodeRunner, Record
 from wbm.envs.perception import Perception
+from wbm.envs.relabel import DemonstrationDriver
 from wbm.envs.rollout_config import RolloutsConfig
 from wbm.envs.world import GRASPS, WorldConfig, make_env, scene_rows, with_start
 from wbm.learning.router import RoutedTeacher, load_suite
@@ -134,7 +135,7 @@ def collect_shard(world: RolloutWorld, shard: int) -> ShardReport:
             clean[KINDS[record.kind]][1] += 1
         recorder.on_end(env, record)
 
-    world.runner.run(TeacherDriver(world.teacher), shard * cfg.episodes, cfg.episodes, recorder.on_frame, on_end)
+    world.runner.run(DemonstrationDriver(world.teacher), shard * cfg.episodes, cfg.episodes, recorder.on_frame, on_end)
     writer.close()
     return ShardReport(shard, recorder.kept, dict(sorted(recorder.reasons.items())), clean)
 

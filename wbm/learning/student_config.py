@@ -148,7 +148,9 @@ class DistillConfig:
         workers: processes that load batches; does not change the result.
         seed: of weights, batches and augmentation.
         device: "cpu" or "cuda".
-        dagger_rounds: rounds of on-policy collection after behaviour cloning.
+        dagger_rounds: rounds after behaviour cloning in which the student acts, controller and teachers say what they
+            would have done, and training goes on with that too (Ross et al. 2011).
+        dagger_episodes: episodes a round.
         dagger_iterations: gradient steps a round.
         dagger_lr: learning rate of the rounds, as a share of `lr`.
         augment: changes to the observations.
@@ -182,6 +184,7 @@ class DistillConfig:
     seed: int = 0
     device: str = "cpu"
     dagger_rounds: int = 0
+    dagger_episodes: int = 384
     dagger_iterations: int = 1000
     dagger_lr: float = 0.3
     augment: AugmentConfig = field(default_factory=AugmentConfig)
@@ -194,6 +197,7 @@ class DistillConfig:
             "val_batches",
             "checkpoint_every",
             "threads",
+            "dagger_episodes",
             "dagger_iterations",
         ):
             if getattr(self, name) < 1:
