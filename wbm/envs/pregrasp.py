@@ -21,6 +21,9 @@ from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
+FEW = (16, 96)
+"""Batches in which the last few candidates are solved."""
+
 ROOMY = 0.015
 """Clearance (m) with which the planner's own pre-grasp is taken before those with more."""
 
@@ -106,8 +109,7 @@ def solve_starts(
     found = torch.zeros(count, dtype=torch.int64, device=device)
     room = torch.full((count, keep), -torch.inf, device=device)
     own = torch.zeros(count, keep, device=device)
-    batch = min(batch, count * keep)
-    solver = _Solver(table, robot, wbc_cfg, batch, device)
+    solvers: dict[int, _Solver] = {}
     columns, tried = Columns(), 0
     jitter, stand = columns.add("jitter", 7), columns.add("stand", 3)
     for _ in range(rounds):
@@ -120,7 +122,12 @@ def solve_starts(
             tried += len(part)
             pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter], (~first_choice).float())
             base = stand_poses(table.base[part], torch.where(first_choice.unsqueeze(1), 0.5, u[:, stand]))
-            q, good, clear = solver.solve(part, pos, quat, base, iterations)
+            size = min(
+                n for n in (*FEW, max(batch, *FEW)) if n >= len(part)
+            )  # a solver's cost is that of its full batch
+            if size not in solvers:
+                solvers[size] = _Solver(table, robot, wbc_cfg, size, device)
+            q, good, clear = solvers[size].solve(part, pos, quat, base, iterations)
             for scene, i in zip(part[good].tolist(), good.nonzero().squeeze(1).tolist(), strict=True):
                 k = int(found[scene])
                 if k < keep:
