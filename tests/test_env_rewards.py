@@ -74,6 +74,14 @@ def test_slip_and_spin_never_pay(slip: float, spin: float) -> None:
     assert rewards.stable(moving, CFG) <= rewards.stable(calm, CFG)
 
 
+@given(st.floats(0, 1), st.floats(0, 3))
+def test_only_holding_still_pays_in_full(speed: float, turn: float) -> None:
+    held = {"lifted": [1.0], "held": [1.0], "holding": [1.0]}
+    moving = state(**held, obj_lin_vel_w=[[speed, 0.0, 0.0]], obj_ang_vel_w=[[0.0, turn, 0.0]])
+    value = rewards.stable(moving, CFG).item()
+    assert value == pytest.approx(1 + CFG.hold * np.exp(-speed / CFG.hold_speed - turn / CFG.hold_turn), rel=1e-5)
+
+
 @settings(max_examples=50)
 @given(st.integers(0, 2**31))
 def test_rotations_against_scipy(seed: int) -> None:
