@@ -122,10 +122,8 @@ def solve_starts(
             tried += len(part)
             pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter], (~first_choice).float())
             base = stand_poses(table.base[part], torch.where(first_choice.unsqueeze(1), 0.5, u[:, stand]))
-            size = min(
-                n for n in (*FEW, max(batch, *FEW)) if n >= len(part)
-            )  # a solver's cost is that of its full batch
-            if size not in solvers:
+            size = min(n for n in (*FEW, max(batch, *FEW)) if n >= len(part))
+            if size not in solvers:  # one costs what its full batch costs
                 solvers[size] = _Solver(table, robot, wbc_cfg, size, device)
             q, good, clear = solvers[size].solve(part, pos, quat, base, iterations)
             for scene, i in zip(part[good].tolist(), good.nonzero().squeeze(1).tolist(), strict=True):
