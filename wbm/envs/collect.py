@@ -43,6 +43,9 @@ def injected_noise(cfg: NoiseConfig, seed: int) -> Callable[[np.ndarray, int], n
             if level == 0.0:
                 continue
             drive = rng.standard_normal(row.shape) * (cfg.innovation * level * scale)
+            if cfg.spell:  # noise comes and goes
+                switches = rng.random(steps) < 1.0 / cfg.spell
+                drive[(np.cumsum(switches) + rng.integers(2)) % 2 == 1] = 0.0
             state = np.zeros(joints.NUM_JOINTS)
             for t in range(steps):
                 state = cfg.correlation * state + drive[t]

@@ -15,19 +15,22 @@ class NoiseConfig:
         scale: base, arm, hand and neck joints, m or rad.
         levels: an episode's noise is one of these factors of the scale, drawn uniformly.
         free: further factor in free space, where larger errors than in contact can be mended.
+        spell: mean number of steps that noise lasts, and that it then pauses, so that its effects are seen mended; 0
+            never pauses.
     """
 
     correlation: float = 0.85
     innovation: float = 0.25
     scale: tuple[float, float, float, float] = (0.012, 0.03, 0.06, 0.02)
     levels: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5)
-    free: float = 2.5
+    free: float = 2.0
+    spell: float = 20.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.correlation < 1:
             raise ValueError(f"rollouts.noise.correlation must be in [0, 1), not {self.correlation}")
-        if not self.levels or min(*self.levels, self.free, 0.0) < 0:
-            raise ValueError("rollouts.noise: levels needs a factor, and neither it nor free may be negative")
+        if not self.levels or min(*self.levels, self.free, self.spell) < 0:
+            raise ValueError("rollouts.noise: levels needs a factor, and nothing may be negative")
 
 
 @dataclass(frozen=True)
