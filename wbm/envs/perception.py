@@ -18,7 +18,7 @@ from wbm.scenes.bank import SceneBank
 from wbm.scenes.objects import ObjectSet
 from wbm.sensors.cloud import PointCloud
 from wbm.sensors.config import SensorsConfig
-from wbm.sensors.depth import DepthCamera
+from wbm.sensors.depth import DepthCamera, pixel_areas
 from wbm.sensors.instances import SceneInstances, hull_meshes
 from wbm.sensors.lidar import Lidar
 from wbm.sensors.scene import RayScene, Semantic
@@ -33,7 +33,7 @@ class Sight:
 
     Attributes:
         obs: the fields of the policy schema, [N, ...] each.
-        target_pixels: depth returns on the target [N].
+        target_pixels: depth returns on the target [N], in pixels of an even grid.
         target_pos_b: target's position in the base frame [N,3], m.
     """
 
@@ -65,6 +65,8 @@ class Perception:
         )
         frames = robot.frames
         self.camera = DepthCamera(cfg.depth, self.scene, exclude_body=frames["camera"].link, seed=seed)
+        areas = pixel_areas(cfg.depth.width, cfg.depth.height, cfg.depth.center)
+        self._areas = torch.as_tensor(areas, dtype=torch.float32, device=device)
         self.lidar = Lidar(cfg.lidar, self.scene, exclude_body=frames["lidar"].link, seed=seed)
         self.clouds = (
             PointCloud(cfg.depth_cloud, self.camera, seed=seed),
@@ -129,7 +131,7 @@ class Perception:
             "prev_action": previous_action.clone(),
             "text": self.text.clone(),
         }
-        pixels = (wp.to_torch(self.camera.id) == int(Semantic.TARGET)).sum(1)
+        pixels = (wp.to_torch(self.camera.id) == int(Semantic.TARGET)).float() @ self._areas
         return Sight(obs, pixels, self._in_base(pos[:, 0], quat[:, 0], object_pose[:, 0, :3]))
 
     def _in_base(self, pos: Tensor, quat: Tensor, point: Tensor) -> Tensor:

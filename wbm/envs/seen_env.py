@@ -46,7 +46,8 @@ class SeenEnv(WholeBodyEnv):
         return super()._live() | own
 
     _EPISODE = ("phase", "started", "_contact_since", "_close_since", "_goal_q", "_goal_pos",
-                "_goal_quat", "_start_q", "_settled_goal", "_corner", "_corners", "_corner_at")  # fmt: skip
+                "_goal_quat", "_far_quat", "_start_q", "_settled_goal", "_corner", "_corners",
+                "_corner_at")  # fmt: skip
 
     def _plan(self, ids: Tensor, scenes: Tensor, start: Tensor, goal: Tensor) -> None:
         if self.guided:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from wbm.control.base_path import BaseMap, Obstacles, base_path
 from wbm.envs.grasp_env import AT_PREGRASP, FULL, SCATTERED, GraspEnv
-from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
+from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, quat_to_mat, rotate
 from wbm.robot import joints
 
 FREE, CONTACT = 0, 1
@@ -23,6 +23,7 @@ LINGER = 0.8
 CALM = (0.05, 0.15)  # m/s of the base and rad/s of arm joints that count as rest
 BEGUN = (0.05, 0.5)  # m and rad off the pre-grasp's line within which a hand that is ahead of it is at work
 LOST = 0.15  # m off the line or behind the pre-grasp from which it has to come anew
+SEEN_FROM = 0.3  # m from the pre-grasp at which the hand turns to how the object lies, which the camera sees by then
 TURN_AHEAD = 0.25  # s by which the target's orientation leads the hand
 MAX_CORNERS = 12
 NEAR_CORNER = 0.15  # m at which a corner of the base's way counts as passed
@@ -38,8 +39,10 @@ class WholeBodyEnv(GraspEnv):
 
     In free space the end-effector target moves at a bounded speed to the planner's own pre-grasp, which is fixed in the
     world (a target that followed the base would make the controller chase itself); while the hand is off the line along
-    which it will approach, the target stays back on that line. The posture is the pre-grasp's, base included. Where the
-    hand goes next so follows from where it is and what it sees, with nothing that a student could not know.
+    which it will approach, the target stays back on that line. From afar a hand that will come from above closes along
+    the base's heading, and turns to how the object lies only where that can be seen. The posture is the pre-grasp's,
+    base included. Where the hand goes next so follows from where it is and what it sees, with nothing that a student
+    could not know.
 
     Where obstacles block the straight way of the base, the base first follows the planner's corners with the arm held
     as it is. A teacher's action counts from the moment the pre-grasp is reached. `step_targets` moves through both
@@ -53,7 +56,8 @@ class WholeBodyEnv(GraspEnv):
         self._near, self._scatter = self.columns.add("near"), self.columns.add("scatter")
         self._contact_since, self._close_since = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(2))
         self._goal_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
-        self._goal_pos, self._goal_quat = torch.zeros(n, 3, device=device), torch.zeros(n, 4, device=device)
+        self._goal_pos = torch.zeros(n, 3, device=device)
+        self._goal_quat, self._far_quat = torch.zeros(n, 4, device=device), torch.zeros(n, 4, device=device)
         self._corner = torch.zeros(n, MAX_CORNERS, 2, device=device)
         self._corners, self._corner_at = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(2))
         self._start_q = torch.zeros(n, joints.NUM_JOINTS, device=device)
@@ -111,6 +115,7 @@ class WholeBodyEnv(GraspEnv):
         self.controller.forward_kinematics()
         ee = self.reader.ee
         self._goal_pos[ids], self._goal_quat[ids] = self.frame_pos[ids, ee], self.frame_quat[ids, ee]
+        self._far_quat[ids] = _along_heading(self._goal_quat[ids], self._goal_q[ids, 2])
         self.q_in.copy_(keep)
         self.controller.forward_kinematics()
         self.posture[ids] = self._goal_q[ids][:, self._body].to(self.posture)
@@ -209,7 +214,8 @@ class WholeBodyEnv(GraspEnv):
         speed = (c.approach_rate * (goal - term.pos).norm(dim=-1, keepdim=True)).clamp(max=c.approach_speed)
         ahead = _towards(term.pos, goal, speed * self.period)
         ahead = s.ee_pos_w + _towards(torch.zeros_like(ahead), ahead - s.ee_pos_w, c.approach_leash)
-        turn = quat_log(quat_mul(quat_conj(s.ee_quat), self._goal_quat))
+        near = (s.ee_pos_w - self._goal_pos).norm(dim=-1, keepdim=True) < SEEN_FROM
+        turn = quat_log(quat_mul(quat_conj(s.ee_quat), torch.where(near, self._goal_quat, self._far_quat)))
         turned = quat_mul(s.ee_quat, quat_exp(_towards(torch.zeros_like(turn), turn, c.approach_turn * TURN_AHEAD)))
         keep = (~free).unsqueeze(1)
         term.velocity.copy_(torch.where(keep, term.velocity, (ahead - term.pos) / self.period))
@@ -252,3 +258,13 @@ def _towards(start: Tensor, goal: Tensor, step: float | Tensor) -> Tensor:
     """Points [N,3] at most `step` (a number or [N,1]) from `start` on the way to `goal`."""
     delta = goal - start
     return start + delta * (step / delta.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
+
+
+def _along_heading(quat: Tensor, heading: Tensor) -> Tensor:
+    """Grasp frames [K,4] that look down turned to close along a heading [K]; the others as they are."""
+    axes = quat_to_mat(quat)
+    down = axes[:, 2, 2] < -0.7
+    turn = heading - torch.atan2(axes[:, 1, 0], axes[:, 0, 0])
+    turn = torch.atan2(torch.sin(turn), torch.cos(turn)) * down
+    zero = torch.zeros_like(turn)
+    return quat_mul(torch.stack([torch.cos(turn / 2), zero, zero, torch.sin(turn / 2)], -1), quat)

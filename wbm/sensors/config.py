@@ -67,6 +67,8 @@ class DepthConfig:
     Attributes:
         width, height: rays.
         hfov_deg, vfov_deg: field of view, degrees.
+        center: spacing of the rays in the middle of the image, as a share of an even grid's; 1 is even. A gaze that
+            keeps its target there sees more of it with as many rays.
         min_range, max_range: planar depth outside of which a return is invalid, m.
         bundle: rays in a culling bundle.
         noise: error model; None is exact.
@@ -77,6 +79,7 @@ class DepthConfig:
     height: int = 60
     hfov_deg: float = 87.0
     vfov_deg: float = 58.0
+    center: float = 1.0
     min_range: float = 0.2
     max_range: float = 3.0
     bundle: int = field(default=32, metadata={"key": False})
@@ -90,6 +93,8 @@ class DepthConfig:
             )
         if not (0 < self.hfov_deg < 180 and 0 < self.vfov_deg < 180):
             raise ValueError("depth camera: fields of view must lie in (0, 180) degrees")
+        if not 0 < self.center <= 1:
+            raise ValueError(f"depth camera: center must lie in (0, 1], not {self.center}")
         if not 0 <= self.min_range < self.max_range:
             raise ValueError("depth camera: need 0 <= min_range < max_range")
 

@@ -10,15 +10,31 @@ from wbm.sensors.ray_sensor import RaySensor
 from wbm.sensors.scene import RayScene
 
 
-def pinhole_rays(width: int, height: int, hfov_deg: float, vfov_deg: float) -> np.ndarray:
+def pinhole_rays(width: int, height: int, hfov_deg: float, vfov_deg: float, center: float = 1.0) -> np.ndarray:
     """Unit rays [H*W,3] through the pixel centres, row by row; x right, y down, z forward.
 
-    `u = (j + 1/2 - W/2) / f_x`, `f_x = W / (2 tan(hfov / 2))`, and so for v.
+    `u = w((j + 1/2 - W/2) / (W/2)) tan(hfov / 2)`, and so for v, with `w(s) = c s + (1 - c) s^3`: denser in the middle
+    where c, `center`, is below 1.
     """
-    x = (np.arange(width) + 0.5 - width / 2) / (width / 2) * np.tan(np.radians(hfov_deg) / 2)
-    y = (np.arange(height) + 0.5 - height / 2) / (height / 2) * np.tan(np.radians(vfov_deg) / 2)
+    x = _warp(width, center) * np.tan(np.radians(hfov_deg) / 2)
+    y = _warp(height, center) * np.tan(np.radians(vfov_deg) / 2)
     rays = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1).reshape(-1, 3)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def pixel_areas(width: int, height: int, center: float) -> np.ndarray:
+    """Area [H*W] of each pixel of `pinhole_rays` in the image plane, in pixels of an even grid."""
+    along = [center + 3 * (1 - center) * _even(size) ** 2 for size in (height, width)]
+    return np.multiply.outer(*along).ravel()
+
+
+def _even(size: int) -> np.ndarray:
+    return (np.arange(size) + 0.5 - size / 2) / (size / 2)
+
+
+def _warp(size: int, center: float) -> np.ndarray:
+    s = _even(size)
+    return center * s + (1 - center) * s**3
 
 
 class DepthCamera(RaySensor):
@@ -34,7 +50,7 @@ class DepthCamera(RaySensor):
             noise.edge, noise.edge_jump, noise.width = config.noise.edge, config.noise.edge_jump, config.width
         super().__init__(
             scene,
-            pinhole_rays(config.width, config.height, config.hfov_deg, config.vfov_deg)[None],
+            pinhole_rays(config.width, config.height, config.hfov_deg, config.vfov_deg, config.center)[None],
             config.min_range,
             config.max_range,
             planar=True,
