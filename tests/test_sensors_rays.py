@@ -15,7 +15,7 @@ from wbm.robot.rotations import quat_to_mat
 from wbm.sensors.bench_scene import robot_bodies, sample_meshes, tabletop
 from wbm.sensors.bundles import GROUP, SUBGROUP, build_table, common_part
 from wbm.sensors.config import DepthConfig, LidarConfig
-from wbm.sensors.depth import DepthCamera, pinhole_rays
+from wbm.sensors.depth import DepthCamera, pinhole_rays, pixel_areas
 from wbm.sensors.lidar import Lidar, scan_rays
 from wbm.sensors.oracle import MujocoScene
 from wbm.sensors.ray_sensor import RaySensor
@@ -235,6 +235,21 @@ def test_camera_covers_its_field_of_view():
     assert np.isclose(np.degrees(np.arctan2(rays[0, -1, 0], rays[0, -1, 2])), half_pixel)
     assert rays[0, 0, 0] < 0 < rays[0, -1, 0]
     assert rays[0, 0, 1] < 0 < rays[-1, 0, 1]
+
+
+def test_a_grid_that_is_denser_in_the_middle_covers_the_same_field():
+    even, dense = (pinhole_rays(80, 60, 87.0, 58.0, c).reshape(60, 80, 3) for c in (1.0, 0.35))
+    assert np.isclose(
+        dense[30, 40:42, 0] / dense[30, 40:42, 2], 0.35 * even[30, 40:42, 0] / even[30, 40:42, 2], rtol=0.02
+    ).all()
+    assert np.abs(dense[0, 0] - even[0, 0]).max() < 0.02
+    areas = pixel_areas(80, 60, 0.35)
+    assert areas.sum() == pytest.approx(80 * 60, rel=2e-3) and areas.reshape(60, 80)[30, 40] == pytest.approx(
+        0.35**2, rel=0.02
+    )
+    # a round target in the middle counts as many pixels of an even grid whichever grid sees it
+    inside = [(np.arccos(grid[..., 2]) < 0.2).ravel() for grid in (even, dense)]
+    assert areas[inside[1]].sum() == pytest.approx(inside[0].sum(), rel=0.05)
 
 
 def test_excluded_body_is_not_seen():
