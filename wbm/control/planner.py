@@ -30,7 +30,7 @@ SWING = 1.2
 AMPLE = 0.05
 """Clearance (m) beyond which more room is worth nothing."""
 
-COMFORT = 0.01
+COMFORT = 0.03
 """What closing a top-down grasp across the heading costs against closing along it, m of the object's width."""
 
 PREFERENCE = 0.75

@@ -173,7 +173,7 @@ class ScatterConfig:
     base: float = 0.2
     yaw: float = 0.4
     arm: float = 0.5
-    neck: float = 0.3
+    neck: float = 0.5
     clearance: float = 0.025
 
     def __post_init__(self) -> None:

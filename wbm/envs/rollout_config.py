@@ -21,7 +21,7 @@ class NoiseConfig:
 
     correlation: float = 0.85
     innovation: float = 0.25
-    scale: tuple[float, float, float, float] = (0.012, 0.03, 0.06, 0.02)
+    scale: tuple[float, float, float, float] = (0.012, 0.03, 0.06, 0.04)
     levels: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5)
     free: float = 2.0
     spell: float = 20.0

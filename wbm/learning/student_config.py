@@ -165,7 +165,7 @@ class DistillConfig:
     clip: float = 1.0
     ema: float = 0.999
     beta: float = 0.5
-    neck_weight: float = 0.5
+    neck_weight: float = 2.0
     contact_gain: float = 3.0
     contact_distance: float = 0.15
     contact_width: float = 0.02

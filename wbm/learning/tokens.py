@@ -18,8 +18,12 @@ from wbm.robot.schema import PROPRIO_LABELS, PolicySchema
 _FAR = -1e4  # a logit that softmax turns into 0 without infinities
 _EE_POS = PROPRIO_LABELS.index("ee_pos_b/x")
 _EE_ROT = PROPRIO_LABELS.index("ee_rot6d_b/0")
+_CAMERA_POS = PROPRIO_LABELS.index("camera_pos_b/x")
+_CAMERA_ROT = PROPRIO_LABELS.index("camera_rot6d_b/0")
 _VELOCITIES = [label.startswith("qd/") for label in PROPRIO_LABELS]
 _LOCAL_CHANNELS = 13
+_SPREAD, _EXTENT, _OBJECT = 0.03, 0.06, 0.1
+"""Metres that count as 1 in the target's spread and extent, and in coordinates about its centroid."""
 
 
 def rotation_from_6d(columns: Tensor) -> Tensor:
@@ -101,6 +105,10 @@ class Tokenizer(nn.Module):
     The target is given by a mask, by the instruction, or by both. Each depth point gets a logit of belonging to the
     target from its position, colour, surroundings, the mask and (FiLM) the instruction; the points that it selects
     give the target's token and its centroid, so that the network has a target where no mask is given.
+
+    How the target lies (which way a hand must turn to close across its narrow side) is a matter of centimetres that is
+    lost among coordinates of metres: second moments and extents of its points in the grasp frame, and an encoder of
+    the points about their centroid, say it.
     """
 
     def __init__(self, schema: PolicySchema, cfg: StudentConfig) -> None:
@@ -124,10 +132,12 @@ class Tokenizer(nn.Module):
         if cfg.lidar_tokens:
             self.lidar = PointEncoder(6, cfg.point_width, cfg.point_width)
             self.scan = nn.Linear(cfg.point_width, width * cfg.lidar_tokens)
-        self.target = nn.Sequential(nn.Linear(14, width), nn.ReLU(), nn.Linear(width, width))
+        self.target = nn.Sequential(nn.Linear(29, width), nn.ReLU(), nn.Linear(width, width))
+        self.shape = PointEncoder(7, cfg.point_width, cfg.point_width)
+        self.shaped = nn.Linear(cfg.point_width, width)
         self.proprio = nn.Linear(num_proprio, width * cfg.proprio_tokens)
         self.prev_action = nn.Linear(schema.action.size, width) if cfg.use_prev_action else None
-        self.num_tokens = 5 + cfg.attention_tokens + cfg.lidar_tokens + cfg.proprio_tokens + cfg.use_prev_action
+        self.num_tokens = 6 + cfg.attention_tokens + cfg.lidar_tokens + cfg.proprio_tokens + cfg.use_prev_action
         self.kind = nn.Parameter(0.02 * torch.randn(self.num_tokens, width))
 
     def forward(self, obs: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
@@ -162,8 +172,25 @@ class Tokenizer(nn.Module):
         masked_ee = ((masked.unsqueeze(1) - ee_pos) @ ee_rot).squeeze(1) * has_mask
         spread = (weights[..., :1] * (xyz - selected.unsqueeze(1)) ** 2).sum((1, 2)).unsqueeze(-1)
         target = [selected - self.centre_b * any_valid, selected_ee, masked - self.centre_b * has_mask, masked_ee]
-        target = torch.cat([*target, has_mask, 10.0 * spread], dim=-1)
-        tokens.append(torch.stack([self.target(target), text], dim=1))
+        # The target's points: those of the mask or, without one, those that are selected.
+        picked = weights[..., :1] / weights[..., :1].amax(1, keepdim=True).clamp(min=1e-6)
+        points = torch.where(has_mask.unsqueeze(1) > 0, mask, picked * valid)
+        centre = torch.where(has_mask > 0, masked, selected)
+        # Where the camera has it: what the neck is to mend.
+        camera_rot = rotation_from_6d(proprio[:, _CAMERA_ROT : _CAMERA_ROT + 6])
+        from_camera = (centre - proprio[:, _CAMERA_POS : _CAMERA_POS + 3]).unsqueeze(1) @ camera_rot
+        sight = from_camera.squeeze(1) / from_camera.norm(dim=-1).clamp(min=0.05) * any_valid
+        about_b = xyz - centre.unsqueeze(1)
+        about_ee = about_b @ ee_rot
+        x, y, z = (about_ee / _SPREAD).unbind(-1)
+        moments = torch.stack([x * x, y * y, z * z, x * y, x * z, y * z], dim=-1).clamp(-9.0, 9.0)
+        moments = (points * moments).sum(1) / points.sum(1).clamp(min=1.0)
+        sides = torch.cat([about_ee, -about_ee], dim=-1).clamp(-0.15, 0.15) / _EXTENT
+        extent = (points * sides).max(dim=1).values
+        target = torch.cat([*target, has_mask, 10.0 * spread, 3.0 * sight, moments, extent], dim=-1)
+        shape = torch.cat([about_ee / _OBJECT, about_b / _OBJECT, points], dim=-1).clamp(-3.0, 3.0)
+        shape = self.shaped(masked_max(self.shape(shape * valid), points))
+        tokens.append(torch.stack([self.target(target), text, shape], dim=1))
 
         if self.cfg.lidar_tokens:
             scan = obs["lidar_xyz"]
