@@ -89,6 +89,8 @@ def _collect(cfg: Any, inputs: Any, folder: Path, policy: Any, number: int) -> l
         jobs = [RoundJob(shard_job(cfg, inputs, i, shards), student, number) for i in range(count)]
         jobs = [replace(job, shard=replace(job.shard, rollouts=each)) for job in jobs]
         waiting = [job for job in jobs if not (folder / f"{job.shard.shard}.done").exists()]
+        for job in waiting:
+            (shards / f"shard-{job.shard.shard:05d}.json").unlink(missing_ok=True)  # finished, but that was not noted
         for done in run_jobs("wbm.learning.dagger", waiting, cfg.rollouts.workers):
             (folder / f"{done}.done").touch()
         (folder / "done").touch()

@@ -11,11 +11,21 @@ import torch
 from student_world import SCHEMA, make_episode, write_shards
 
 from stages import distill as stage
+from wbm.artifacts.episodes import EpisodeWriter
+from wbm.control.config import WbcConfig
+from wbm.envs.config import EnvConfig
+from wbm.envs.rollout_config import NoiseConfig, RolloutsConfig
+from wbm.envs.world import WorldConfig
+from wbm.learning import dagger, workers
 from wbm.learning.dataset import EpisodeDataset, to_tensors
 from wbm.learning.distill import CHECKPOINT, distill, learning_rate, validate
 from wbm.learning.distill_loss import distill_loss
-from wbm.learning.student import StudentPolicy, load_student
+from wbm.learning.rollouts import ShardJob
+from wbm.learning.student import Student, StudentPolicy, load_student
 from wbm.learning.student_config import AugmentConfig, DistillConfig, StudentConfig
+from wbm.robot.config import MjcfOptions
+from wbm.sensors.config import SensorsConfig
+from wbm.sim.config import SimConfig
 
 SMALL = StudentConfig(width=32, heads=2, layers=1, feedforward=64, point_width=32, attention_tokens=2, proprio_tokens=2)
 SHORT = DistillConfig(
@@ -235,3 +245,67 @@ def test_stage_publishes_a_student_that_acts(shards, tmp_path):
     obs = {f.name: np.asarray(episode[f.name]) for f in SCHEMA.observation}
     obs = {k: v.astype(SCHEMA.field_named(k).dtype) for k, v in obs.items()}
     np.testing.assert_array_equal(policy.act(obs).numpy(), StudentPolicy(expected.network).act(obs).numpy())
+
+
+def test_a_round_of_dagger_is_taken_up_where_it_was_interrupted(tmp_path, monkeypatch):
+    made, stop_after = [], [1]
+
+    def make(module, jobs, workers):
+        assert module == "wbm.learning.dagger"
+        for job in jobs:
+            made.append(job)
+            writer = EpisodeWriter(job.shard.folder, SCHEMA, job.shard.shard)
+            writer.add(make_episode(job.shard.shard, 3))
+            writer.close()
+            if job.shard.shard in stop_after:
+                raise KeyboardInterrupt  # the shard is whole, but nobody could note it
+            yield job.shard.shard
+
+    monkeypatch.setattr(workers, "run_jobs", make)
+    cfg = SimpleNamespace(
+        seed=3,
+        robot=MjcfOptions(),
+        sim=SimConfig(),
+        wbc=WbcConfig(),
+        env=EnvConfig(),
+        sensors=SensorsConfig(),
+        rollouts=RolloutsConfig(),
+        distill=replace(SHORT, dagger_rounds=2, dagger_episodes=200),
+    )
+    inputs = {"assets": SimpleNamespace(path=tmp_path / "a"), "teacher/side": SimpleNamespace(path=tmp_path / "t")}
+    policy = StudentPolicy(Student(SCHEMA, SMALL))
+    with pytest.raises(KeyboardInterrupt):
+        stage._collect(cfg, inputs, tmp_path / "round-2", policy, 2)
+    assert [job.shard.shard for job in made] == [0, 1]
+    stop_after.clear()
+    paths = stage._collect(cfg, inputs, tmp_path / "round-2", policy, 2)
+    assert [job.shard.shard for job in made] == [0, 1, 1, 2], "what is noted is not made again, what is not is"
+    assert len(paths) == 3 and stage._collect(cfg, inputs, tmp_path / "round-2", policy, 2) == paths
+    assert len(made) == 4
+    job = made[-1]
+    assert job.number == 2 and job.shard.teachers == {"side": tmp_path / "t"} and job.shard.assets == tmp_path / "a"
+    assert 3 * job.shard.rollouts.episodes >= 200 > 3 * (job.shard.rollouts.episodes - 1)
+    acts = load_student(job.student).network.state_dict()
+    assert all(torch.equal(v, acts[k]) for k, v in policy.network.state_dict().items())
+
+
+def test_rounds_of_dagger_differ_in_their_episodes_and_inject_no_noise(tmp_path, monkeypatch):
+    class Asked(Exception):
+        pass
+
+    def world(job):
+        raise Asked(job)
+
+    monkeypatch.setattr(dagger, "RolloutWorld", world)
+    monkeypatch.setattr(dagger, "_world", None)
+    settings = WorldConfig(MjcfOptions(), SimConfig(), WbcConfig(), EnvConfig())
+    rollouts = RolloutsConfig(pregrasp_share=0.3, scatter_share=0.5)
+    shard = ShardJob(0, tmp_path, tmp_path, {}, settings, SensorsConfig(), rollouts, seed=7)
+    seeds = {shard.seed}
+    for number in (1, 2):
+        with pytest.raises(Asked) as asked:
+            dagger.work(dagger.RoundJob(shard, tmp_path, number))
+        where = asked.value.args[0]
+        assert where.rollouts == replace(rollouts, pregrasp_share=0.0, noise=NoiseConfig(levels=(0.0,)))
+        seeds.add(where.seed)
+    assert len(seeds) == 3

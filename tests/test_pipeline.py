@@ -44,6 +44,15 @@ def test_the_report_and_the_bundle_hold_what_the_run_made(root):
     assert manifest["metrics"]["parity"] <= 1e-5
 
 
+def test_the_student_says_what_it_was_made_from_its_own_episodes_included(root):
+    folder = next((root / "student").glob("*/*/manifest.json")).parent
+    manifest = json.loads((folder / "manifest.json").read_text().splitlines()[0])
+    assert set(manifest["inputs"]) == {"rollouts", "assets", "teacher/top_down"}
+    assert json.loads((folder / "curve.json").read_text())[-1]["step"] == 25  # 20 of cloning and a round of 5
+    rollouts = json.loads(next((root / "rollouts").glob("*/*/manifest.json")).read_text().splitlines()[0])
+    assert manifest["metrics"]["episodes"] == rollouts["metrics"]["kept"] + 2  # too few for one to be held out
+
+
 def test_a_second_run_has_nothing_to_do(root):
     assert wbm("plan", "--check", *SMALL, root=root).returncode == 0
     again = wbm("run", *SMALL, root=root)

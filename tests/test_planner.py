@@ -6,11 +6,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.env_world import scenes, world
 from wbm.control.base_path import MARGIN, BaseMap, Obstacles, base_path
 from wbm.control.config import WbcConfig
-from wbm.control.planner import GRASPS, Target, choose_grasp, fits, pregrasp_poses
+from wbm.control.planner import COMFORT, GRASPS, SIDE_ROOM, Target, choose_grasp, fits, pregrasp_poses
 from wbm.envs import whole_body
 from wbm.envs.binding import SceneBinding
 from wbm.envs.config import EnvConfig
@@ -60,6 +62,40 @@ def test_a_side_grasp_is_level_and_comes_from_where_the_base_stands(swing):
     offset = torch.tensor([1.0, 0.2, 0.8]) - pos[0]
     assert float(offset @ ahead) > 0.06 + 0.05
     torch.testing.assert_close(offset, ahead * (offset @ ahead), atol=1e-5, rtol=0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_top_down_grasp_takes_the_cheapest_width_of_float64(seed):
+    """Boxes from long to nearly square: width against what closing across the heading costs."""
+    rng = np.random.default_rng(seed)
+    half = (0.04 + rng.uniform(0.0, 0.03) * rng.integers(2), 0.04, 0.05)
+    heading, yaw = rng.uniform(-np.pi, np.pi, 2)
+    box = target(half, yaw, heading)
+    closing = quat_to_mat(pregrasp_poses(box, "top_down", 0.06, torch.tensor([0.5]))[1])[0, :, 0].double().numpy()
+
+    def cost(angle):
+        width = 2 * (half[0] * np.abs(np.cos(angle - yaw)) + half[1] * np.abs(np.sin(angle - yaw)))
+        return width + COMFORT * np.sin(angle - heading) ** 2
+
+    every = np.linspace(0.0, np.pi, 180, endpoint=False)
+    taken = cost(np.arctan2(closing[1], closing[0]))
+    assert taken == pytest.approx(cost(every).min(), abs=1e-6)
+    assert closing @ [np.cos(heading), np.sin(heading), 0.0] >= -1e-6  # away from the base
+
+
+@pytest.mark.parametrize("heading", [-2.0, 0.0, 0.7, 3.1])
+def test_a_round_thing_is_closed_upon_along_the_heading(heading):
+    round_thing = replace(target(heading=heading), width=torch.full((1, 180), 0.07))
+    closing = quat_to_mat(pregrasp_poses(round_thing, "top_down", 0.06, torch.tensor([0.5]))[1])[0, :, 0]
+    ahead = torch.tensor([np.cos(heading), np.sin(heading), 0.0], dtype=torch.float32)
+    assert float(closing @ ahead) > np.cos(np.radians(0.51))  # the nearest of 180 directions
+
+
+@pytest.mark.parametrize("half_height", [0.03, 0.099, 0.101, 0.2])
+def test_a_side_grasp_keeps_room_below_the_hand(half_height):
+    pos, _ = pregrasp_poses(target(half=(0.03, 0.03, half_height)), "side", 0.06, torch.tensor([0.5]))
+    assert float(pos[0, 2]) == pytest.approx(max(0.8, 0.8 - half_height + SIDE_ROOM), abs=1e-6)
 
 
 def test_geometry_rules_grasps_out():

@@ -16,7 +16,7 @@ from wbm.learning.export import check_parity, export_onnx, random_observation
 from wbm.learning.student import Student, StudentPolicy, count_parameters, load_student, save_student
 from wbm.learning.student_config import AugmentConfig, DistillConfig, StudentConfig
 from wbm.learning.tokens import local_shape, masked_max, masked_softmax, rotation_from_6d
-from wbm.robot.schema import PolicySchema
+from wbm.robot.schema import PROPRIO_LABELS, PolicySchema
 
 TOLERANCE = 2e-5
 
@@ -128,16 +128,29 @@ def test_every_input_matters_and_every_switch_switches_it_off():
         "depth_rgb": lambda v: 255 - v,
         "depth_xyz": lambda v: v + 0.05 * rng.standard_normal(v.shape).astype("f4"),
     }
+    changes["qd"] = lambda v: v + np.array([label.startswith("qd/") for label in PROPRIO_LABELS])
     off = {"text": {"use_text": False}, "depth_target": {"use_mask": False}}
-    off |= {"prev_action": {"use_prev_action": False}, "lidar_xyz": {"lidar_tokens": 0}}
+    off |= {"prev_action": {"use_prev_action": False}, "lidar_xyz": {"lidar_tokens": 0}, "qd": {"use_velocity": False}}
+    fields = {"qd": "proprio"}
     for name, change in changes.items():
-        obs = make_obs()
-        changed = obs | {name: change(obs[name]).astype(obs[name].dtype)}
-        policy = make_policy()
+        obs, field = make_obs(), fields.get(name, name)
+        changed = obs | {field: change(obs[field]).astype(obs[field].dtype)}
+        policy = make_policy(use_prev_action=True, use_velocity=True)
         assert np.abs(outputs(policy, changed)["action"] - outputs(policy, obs)["action"]).max() > 1e-4, name
         if name in off:
             policy = make_policy(**off[name])
             np.testing.assert_array_equal(outputs(policy, changed)["action"], outputs(policy, obs)["action"], name)
+
+
+def test_by_default_the_student_sees_neither_velocities_nor_its_last_action():
+    rng, obs, policy = np.random.default_rng(3), make_obs(), make_policy()
+    velocity = np.array([label.startswith("qd/") for label in PROPRIO_LABELS])
+    assert velocity.sum() == 32
+    proprio = obs["proprio"] + 9.0 * velocity * rng.standard_normal(obs["proprio"].shape)
+    changed = obs | {"proprio": proprio.astype("f4"), "prev_action": obs["prev_action"] + np.float32(1.0)}
+    np.testing.assert_array_equal(outputs(policy, changed)["action"], outputs(policy, obs)["action"])
+    changed["proprio"] = (obs["proprio"] + 0.01 * ~velocity).astype("f4")
+    assert np.abs(outputs(policy, changed)["action"] - outputs(policy, obs)["action"]).max() > 1e-5
 
 
 def test_an_environment_does_not_see_its_neighbours_and_empty_clouds_are_harmless():
@@ -210,11 +223,12 @@ def test_another_version_or_other_sizes_are_refused(tmp_path):
         load_student(tmp_path)
 
 
-def test_onnx_computes_the_same():
-    policy = make_policy(chunk=2, width=32, heads=2, point_width=16)
+@pytest.mark.parametrize("knows", [False, True])
+def test_onnx_computes_the_same(knows):
+    policy = make_policy(chunk=2, width=32, heads=2, point_width=16, use_velocity=knows, use_prev_action=knows)
     model = export_onnx(policy)
     assert check_parity(policy, model, num=7, seed=5) < 1e-5
-    changed = make_policy(chunk=2, width=32, heads=2, point_width=16)
+    changed = make_policy(chunk=2, width=32, heads=2, point_width=16, use_velocity=knows, use_prev_action=knows)
     with torch.no_grad():
         changed.network.heads[3][2].bias.add_(0.01)
     assert check_parity(changed, model) > 5e-3, "the check must see a difference"
@@ -233,6 +247,7 @@ def test_exported_twice_it_gives_the_same_bytes():
         (lambda: StudentConfig(chunk=0), r"student.chunk must lie in \[1, 8192\]"),
         (lambda: StudentConfig(use_text=False, use_mask=False), "both off"),
         (lambda: DistillConfig(lr=0.0), "distill.lr must be positive"),
+        (lambda: DistillConfig(dagger_lr=0.0), "distill.dagger_lr must be positive"),
         (lambda: DistillConfig(val_share=1.0), "val_share"),
         (lambda: AugmentConfig(mask_drop=1.5), r"distill.augment.mask_drop must lie in \[0, 1\]"),
     ],

@@ -30,9 +30,8 @@ class SceneTable:
         base: base x, y, yaw from which the target is in reach [S,3]: on the straight line from the start pose, facing
             the target, so that a policy which sees the target knows where to stand.
         q_start: collision-free joint positions away from the support [S,32].
-        obstacle_type, obstacle_size, obstacle_pos, obstacle_quat: the controller's obstacles [S,M,...]; the
-        target's own
-            boxes are unused.
+        obstacle_type, obstacle_size, obstacle_pos, obstacle_quat: the controller's obstacles [S,M,...]; the target's
+            own boxes are unused.
     """
 
     target_pos: Tensor
@@ -125,7 +124,7 @@ def _widths(points: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def _stand(bank: SceneBank, rows: np.ndarray) -> np.ndarray:
-    """Base poses [S,3] as far from the targets as the bank's own, on the lines from the start poses."""
+    """Base poses [S,3] as far from the targets as the bank's own, on the lines from the start poses, facing them."""
     target = bank.object_pos[rows, 0, :2]
     reach = np.linalg.norm(target - bank.base_grasp[rows, :2], axis=1, keepdims=True)
     away = target - bank.q_start[rows, :2]

@@ -28,8 +28,9 @@ _OBSERVED = (
 
 
 def injected_noise(cfg: NoiseConfig, seed: int) -> Callable[[np.ndarray, int], np.ndarray]:
-    """A function (episodes [K], steps T) -> noise [K,T,32] on joint targets; each row depends on (seed,
-    episode) alone.
+    """A function (episodes [K], steps T) -> noise [K,T,32] on joint targets; an episode's depends on it and seed alone.
+
+    It depends on `steps` too: what is drawn for the spells follows what is drawn for the steps.
     """
     scale = np.zeros(joints.NUM_JOINTS)
     for value, group in zip(cfg.scale, (joints.BASE, joints.ARM, joints.HAND, joints.NECK), strict=True):

@@ -166,7 +166,7 @@ class ScatterConfig:
         yaw: largest offset of its heading, rad.
         arm: largest offset of each arm joint, rad.
         neck: largest offset of each neck joint, rad.
-        clearance: least distance from everything, m.
+        clearance: least distance from everything, m; felt up to the controller's reach (`wbc.reach`, `wbc.reach_self`).
     """
 
     per_scene: int = 6
@@ -193,7 +193,7 @@ class EnvConfig:
         approach_s: time allowed for the approach in whole-body episodes, s.
         approach_speed: speed of the end-effector target on its way to the pre-grasp, m/s.
         approach_rate: it slows down to this times the distance left, 1/s.
-        approach_turn: the same for rotation, rad/s.
+        approach_turn: largest speed at which the target turns there, rad/s.
         approach_leash: how far the target may run ahead of the hand, m.
         approach_back: the way leads over a point this far behind the pre-grasp against the approach direction, m.
         success_height: lift above the settled height that counts, m.
@@ -254,8 +254,11 @@ class EnvConfig:
                 "env.pregrasp_share and env.scatter_share must be within 0 and 1 together, not "
                 f"{self.pregrasp_share} and {self.scatter_share}"
             )
-        if self.approach_rate <= 0:
-            raise ValueError(f"env.approach_rate must be positive, not {self.approach_rate}")
+        for name in ("approach_s", "approach_speed", "approach_rate", "approach_turn", "approach_leash"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"env.{name} must be positive, not {getattr(self, name)}")
+        if self.approach_back < 0:
+            raise ValueError(f"env.approach_back must not be negative, not {self.approach_back}")
         if self.episode_s <= self.success_hold_s:
             raise ValueError(f"env.episode_s ({self.episode_s}) must exceed env.success_hold_s ({self.success_hold_s})")
         if 0 < self.finish_s < self.success_hold_s:

@@ -214,7 +214,8 @@ class EpisodeRunner:
             sight = self.perception.observe(q, s.qd.float(), poses, self._previous, elapsed)
         env.noise = None
         if self.noise:
-            noise = self._noise[elapsed.clamp(max=len(self._noise) - 1), torch.arange(env.num_envs)]
+            rows = torch.arange(env.num_envs, device=env.device)
+            noise = self._noise[elapsed.clamp(max=len(self._noise) - 1), rows]
             env.noise = noise * torch.where(phase == 0, self.free_noise, 1.0).unsqueeze(1)
         _, _, done, info = driver.step(env, sight)
         command = info["ctrl"].float()

@@ -244,7 +244,10 @@ class _Solver:
         return self.q[:size].clone(), good[:size].clone(), self.distance[:size].clone()
 
     def clearance(self, scenes: Tensor, q: Tensor) -> Tensor:
-        """Distance [B] of joints `q` [B,32] from everything in their scenes and from themselves, m."""
+        """Distance [B] of joints `q` [B,32] from everything in their scenes and from themselves, m.
+
+        1e6 where nothing is within the controller's reach.
+        """
         self.q.copy_(q[self._show(scenes)])
         self.controller.reset(torch.arange(self.batch, device=scenes.device))  # pyright: ignore[reportArgumentType]
         self.controller.step()

@@ -29,8 +29,10 @@ class NoiseConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.correlation < 1:
             raise ValueError(f"rollouts.noise.correlation must be in [0, 1), not {self.correlation}")
-        if not self.levels or min(*self.levels, self.free, self.spell) < 0:
+        if not self.levels or min(*self.levels, *self.scale, self.innovation, self.free) < 0:
             raise ValueError("rollouts.noise: levels needs a factor, and nothing may be negative")
+        if self.spell != 0 and self.spell < 1:
+            raise ValueError(f"rollouts.noise.spell must be 0 or at least one step, not {self.spell}")
 
 
 @dataclass(frozen=True)

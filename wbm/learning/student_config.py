@@ -202,7 +202,7 @@ class DistillConfig:
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"distill.{name} must be at least 1, is {getattr(self, name)}")
-        for name in ("lr", "clip", "beta", "contact_width"):
+        for name in ("lr", "clip", "beta", "contact_width", "dagger_lr"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"distill.{name} must be positive, is {getattr(self, name)}")
         for name in ("data_share", "pregrasp_share", "val_share", "lr_final", "ema"):
