@@ -12,7 +12,7 @@ from torch import Tensor
 from wbm.control.config import WbcConfig
 from wbm.control.planner import Target, pregrasp_poses
 from wbm.control.wbc import WholeBodyController
-from wbm.envs.actions import HAND_OPEN
+from wbm.envs.actions import HAND_CLOSED, HAND_OPEN
 from wbm.envs.binding import SceneTable
 from wbm.envs.config import EnvConfig, ScatterConfig
 from wbm.envs.draws import Columns, episode_uniforms
@@ -181,6 +181,7 @@ def scatter_starts(
     high = torch.tensor(robot.q_max, dtype=torch.float32, device=device)
     columns, tried = Columns(), 0
     along, aside = columns.add("along"), columns.add("aside", joints.NUM_JOINTS)
+    closure, closed = columns.add("closure"), torch.tensor(HAND_CLOSED, device=device)
     for place in range(cfg.per_scene):
         waiting = everything
         for _ in range(rounds):
@@ -191,7 +192,8 @@ def scatter_starts(
                 tried += len(part)
                 way = table.q_start[part] + u[:, along] * (goal[part] - table.q_start[part])
                 q = (way + offset * (2.0 * u[:, aside] - 1.0)).clamp(low, high)
-                q[:, joints.HAND] = goal[part][:, joints.HAND]
+                grip = (2.0 * u[:, closure] - 1.0).clamp(min=0.0)  # half of the hands are open, the others more or less closed
+            q[:, joints.HAND] = goal[part][:, joints.HAND] + grip * (closed - goal[part][:, joints.HAND])
                 free = solver.clearance(part, q) > cfg.clearance
                 out[part[free], place] = q[free]
                 left.append(part[~free])
