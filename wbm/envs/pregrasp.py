@@ -165,7 +165,7 @@ def scatter_starts(
     seed: int = 0,
     device: str = "cpu",
     batch: int = 512,
-    rounds: int = 12,
+    rounds: int = 24,
 ) -> Tensor:
     """Starts between the scenes' start poses and `goal` [S,32], offset at random and clear of everything: [S,P,32].
 
@@ -192,9 +192,12 @@ def scatter_starts(
                 tried += len(part)
                 way = table.q_start[part] + u[:, along] * (goal[part] - table.q_start[part])
                 q = (way + offset * (2.0 * u[:, aside] - 1.0)).clamp(low, high)
-                grip = (2.0 * u[:, closure] - 1.0).clamp(min=0.0)  # half of the hands are open, the others more or less closed
-            q[:, joints.HAND] = goal[part][:, joints.HAND] + grip * (closed - goal[part][:, joints.HAND])
+                hand = goal[part][:, joints.HAND]
+                q[:, joints.HAND] = hand
                 free = solver.clearance(part, q) > cfg.clearance
+                # Half of the hands are open, the others more or less closed (fingers that are near each other are).
+                grip = (2.0 * u[:, closure] - 1.0).clamp(min=0.0)
+                q[:, joints.HAND] = hand + grip * (closed - hand)
                 out[part[free], place] = q[free]
                 left.append(part[~free])
             waiting = torch.cat(left)
