@@ -15,6 +15,7 @@ from tests.env_world import world
 from wbm.control.base_path import Obstacles
 from wbm.control.config import WbcConfig
 from wbm.envs import pregrasp
+from wbm.envs.actions import HAND_CLOSED
 from wbm.envs.config import EnvConfig, ScatterConfig
 from wbm.envs.pregrasp import NECK_ASIDE, ROOMY, StartBank, scatter_starts, solve_starts
 from wbm.robot import joints
@@ -56,9 +57,9 @@ class ScriptedSolver:
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), keep=st.integers(1, 3), batch=st.sampled_from([3, 64]))
 def test_the_planners_own_comes_first_where_it_has_room_else_the_roomiest(monkeypatch, seed, keep, batch):
+    table = world()[0].table  # made once and kept, so never with the scripted solver
     monkeypatch.setattr(pregrasp, "_Solver", ScriptedSolver)
     ScriptedSolver.rng, ScriptedSolver.tried = np.random.default_rng(seed), []
-    table = world()[0].table
     cfg = replace(EnvConfig(), starts_per_scene=keep)
     try:
         bank = solve_starts(table, load_robot(), WbcConfig(), cfg, "top_down", seed, batch=batch)
@@ -120,9 +121,13 @@ def test_scattered_starts_are_clear_bounded_and_repeatable():
     assert float(placed.float().mean()) > 0.9
     for scene, place in placed.nonzero().tolist():
         q, a, b = (x.numpy().astype(np.float64) for x in (out[scene, place], begin[scene], goal[scene]))
-        assert clearance(scene, q) > cfg.clearance - 1e-4
+        opened = q.copy()
+        opened[joints.HAND] = b[joints.HAND]
+        assert clearance(scene, opened) > cfg.clearance - 1e-4
         assert (q >= robot.q_min - 1e-6).all() and (q <= robot.q_max + 1e-6).all()
-        np.testing.assert_array_equal(q[joints.HAND], b[joints.HAND])
+        open_to_closed = np.asarray(HAND_CLOSED) - b[joints.HAND]
+        grip = (q - b)[joints.HAND] / np.where(np.abs(open_to_closed) > 1e-6, open_to_closed, np.inf)
+        assert grip.min() >= -1e-5 and grip.max() <= 1.0 + 1e-5 and np.ptp(grip[np.abs(open_to_closed) > 1e-6]) < 1e-4
         # There is one place on the way from which every joint is within its offset.
         way = (b - a)[body]
         moving = np.abs(way) > 1e-6
