@@ -59,8 +59,9 @@ def test_comments_and_docstrings_rerun_nothing(sources):
 @pytest.mark.parametrize(
     ("path", "stages"),
     [
-        ("wbm/kernels/rays.py", {"generate-rollouts", "evaluate"}),
-        ("wbm/kernels/wbc_qp.py", {"train-teacher", "generate-rollouts", "evaluate"}),
+        # distill plays episodes of its own in rounds of DAgger
+        ("wbm/kernels/rays.py", {"generate-rollouts", "distill", "evaluate"}),
+        ("wbm/kernels/wbc_qp.py", {"train-teacher", "generate-rollouts", "distill", "evaluate"}),
         ("wbm/learning/distill.py", {"distill"}),
         ("wbm/report/page.py", {"evaluate"}),
         ("wbm/learning/export.py", {"deploy-export"}),
@@ -81,7 +82,7 @@ def test_a_changed_module_reruns_exactly_the_stages_that_use_it(sources, path, s
         ("distill.lr=5e-4", {"distill"}),
         ("ppo.lr=5e-4", {"train-teacher"}),
         ("evaluation.episodes=7", {"evaluate"}),
-        ("sensors.depth.width=40", {"generate-rollouts", "evaluate"}),
+        ("sensors.depth.width=40", {"generate-rollouts", "distill", "evaluate"}),
         ("scenes.count=3", {"prepare-assets"}),
         ("seed=9", {"prepare-assets", "train-teacher", "generate-rollouts", "distill", "evaluate"}),
         ("rollouts.workers=7", set()),
