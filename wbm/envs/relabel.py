@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from wbm.envs.grasp_env import GraspEnv
 from wbm.envs.perception import Sight, joint_limits
 from wbm.envs.whole_body import FREE, WholeBodyEnv
 from wbm.robot.schema import PolicySchema, to_target
@@ -27,8 +28,9 @@ class DemonstrationDriver:
     def __init__(self, teacher: Callable[[Tensor], Tensor]) -> None:
         self.teacher = teacher
 
-    def step(self, env: WholeBodyEnv, sight: Sight | None) -> tuple[Tensor, Tensor, Tensor, dict]:
+    def step(self, env: GraspEnv, sight: Sight | None) -> tuple[Tensor, Tensor, Tensor, dict]:
         """Act once in all environments."""
+        assert isinstance(env, WholeBodyEnv)
         env.resume(env.phase == FREE)
         return env.step(self.teacher(env.obs))
 
@@ -44,7 +46,7 @@ class RelabelDriver:
     Args:
         student: maps the schema's observation to 32 actions.
         teacher: maps the privileged observation to an action.
-        env: where both act.
+        env: where both act, a `WholeBodyEnv`.
     """
 
     needs_sight = True
@@ -53,15 +55,15 @@ class RelabelDriver:
         self,
         student: Callable[[dict[str, Tensor]], Tensor],
         teacher: Callable[[Tensor], Tensor],
-        env: WholeBodyEnv,
+        env: GraspEnv,
         schema: PolicySchema,
     ) -> None:
         self.student, self.teacher, self.schema = student, teacher, schema
         self.low, self.high = joint_limits(env.robot, env.device)
 
-    def step(self, env: WholeBodyEnv, sight: Sight | None) -> tuple[Tensor, Tensor, Tensor, dict]:
+    def step(self, env: GraspEnv, sight: Sight | None) -> tuple[Tensor, Tensor, Tensor, dict]:
         """Act once in all environments."""
-        assert sight is not None
+        assert sight is not None and isinstance(env, WholeBodyEnv)
         env.find_phase()
         env.resume(torch.ones_like(env.phase, dtype=torch.bool))
         action = torch.as_tensor(self.student(sight.obs), dtype=torch.float32, device=env.device)
