@@ -15,6 +15,7 @@ from stages.cli import main
 from wbm.robot import export, joints, model
 from wbm.robot.config import MjcfOptions
 from wbm.robot.facts import FactsError
+from wbm.robot.rotations import unit_quat
 from wbm.scenes.assets import load_assets
 
 ROOT = Path(__file__).parents[1]
@@ -183,3 +184,8 @@ def test_the_command_line_takes_a_robot_from_show_to_assets(tmp_path, monkeypatc
         "",
         "wbm: moved.yaml: mounts.arm.pos: must be 3 finite numbers\n",
     )
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1.0, 1.4e154, 1e300])
+def test_a_quaternion_of_any_length_is_a_direction(scale):
+    np.testing.assert_allclose(unit_quat(np.array([3.0, 0.0, -4.0, 0.0]) * scale), [0.6, 0.0, -0.8, 0.0], rtol=1e-12)

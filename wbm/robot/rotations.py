@@ -12,6 +12,7 @@ from wbm.robot import proprio
 def unit_quat(quat: Any) -> np.ndarray:
     """Return `quat` scaled to unit length, as MuJoCo does on load."""
     q = np.asarray(quat, dtype=np.float64)
+    q = q / np.abs(q).max()  # else the squares of huge values overflow
     return q / np.linalg.norm(q)
 
 
