@@ -146,6 +146,8 @@ class WholeBodyEnv(GraspEnv):
         they would have done. Here the controller starts from the measured joints, and the targets of hand and fingers
         are those that were executed, so that the next command follows from the present state alone.
         """
+        if not bool(which.any()):
+            return
         s, c, row = self.state, self._controller_state, which.unsqueeze(1)
         executed = self.sim.ctrl[:, : joints.NUM_JOINTS].float()
         # The command leads the new target by the actuators' delay; the target must not lead the joints by a step more.

@@ -14,6 +14,7 @@ from wbm.deploy.bundle import Bundle
 from wbm.envs.collect import Recorder
 from wbm.envs.episodes import Driver, EpisodeRunner, Frame, Record, StudentDriver, TeacherDriver
 from wbm.envs.perception import Perception
+from wbm.envs.relabel import DemonstrationDriver
 from wbm.envs.world import GRASPS, WorldConfig, make_env, scene_rows, with_start
 from wbm.learning.router import RoutedTeacher, load_suite
 from wbm.learning.runtime_driver import RuntimeDriver
@@ -96,7 +97,8 @@ class EvaluationWorld:
     def _driver(self, suite: Any) -> Driver:
         job = self.job
         if job.kind == "teacher":
-            return TeacherDriver(RoutedTeacher(suite, self.env))
+            teacher = RoutedTeacher(suite, self.env)
+            return DemonstrationDriver(teacher) if job.start == "whole_body" else TeacherDriver(teacher)
         if job.kind == "bundle":
             bundle = Bundle.open(job.policy / "policy.wbm")
             self._check_schema(bundle.contract.schema)
