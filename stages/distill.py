@@ -75,6 +75,7 @@ def _collect(cfg: Any, inputs: Any, folder: Path, policy: Any, number: int) -> l
     from dataclasses import replace
 
     from stages.generate_rollouts import SHARDS, shard_job
+    from wbm.artifacts.episode_layout import shard_index
     from wbm.artifacts.episode_reader import shard_paths
     from wbm.learning.dagger import RoundJob
     from wbm.learning.student import save_student
@@ -90,7 +91,7 @@ def _collect(cfg: Any, inputs: Any, folder: Path, policy: Any, number: int) -> l
         jobs = [replace(job, shard=replace(job.shard, rollouts=each)) for job in jobs]
         waiting = [job for job in jobs if not (folder / f"{job.shard.shard}.done").exists()]
         for job in waiting:
-            (shards / f"shard-{job.shard.shard:05d}.json").unlink(missing_ok=True)  # finished, but that was not noted
+            shard_index(shards, job.shard.shard).unlink(missing_ok=True)  # finished, but that was not noted
         for done in run_jobs("wbm.learning.dagger", waiting, cfg.rollouts.workers):
             (folder / f"{done}.done").touch()
         (folder / "done").touch()

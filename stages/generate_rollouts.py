@@ -30,6 +30,7 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
         draft: shards go to `draft.path/shards`, a report of each to `draft.path/reports`.
         progress: offers `task`.
     """
+    from wbm.artifacts.episode_layout import shard_index
     from wbm.learning.rollouts import ShardReport, merge_reports
     from wbm.learning.workers import run_jobs
 
@@ -40,7 +41,7 @@ def run(cfg: Any, inputs: dict[str, Any], draft: Any, progress: Any) -> None:
     # A shard is done when its report is on the disk, which is flushed after the shard; anything less is made again.
     waiting = [job for job in jobs if not _report(reports, job.shard).exists()]
     for job in waiting:
-        (folder / f"shard-{job.shard:05d}.json").unlink(missing_ok=True)  # finished, but its report was lost
+        shard_index(folder, job.shard).unlink(missing_ok=True)  # finished, but its report was lost
     with progress.task("rollouts", total=len(jobs)) as task:
         task.update(len(jobs) - len(waiting))
         for report in run_jobs("wbm.learning.rollouts", waiting, cfg.rollouts.workers):

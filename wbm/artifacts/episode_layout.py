@@ -7,7 +7,9 @@ sentence, not once a step.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,6 +43,11 @@ class StepField:
         """Bytes of a step on disk, before compression."""
         count = int(np.prod(self.shape, dtype=np.int64))
         return (count + 7) // 8 if self.stored == "bits" else count * np.dtype(self.stored).itemsize
+
+
+def shard_index(folder: str | os.PathLike[str], number: int) -> Path:
+    """Where the index of a shard lies; the shard is complete when it exists."""
+    return Path(folder) / f"shard-{number:05d}.json"
 
 
 STARTS = ("full", "pregrasp", "scattered")

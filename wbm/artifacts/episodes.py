@@ -28,6 +28,7 @@ from wbm.artifacts.episode_layout import (
     TEXT_FIELD,
     EpisodeInfo,
     StepLayout,
+    shard_index,
 )
 
 
@@ -44,10 +45,9 @@ class EpisodeWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str], schema: Any, shard_id: int) -> None:
-        self._name = f"shard-{shard_id:05d}"
         self._dir = Path(path)
-        self._index_path = self._dir / f"{self._name}.json"
-        self._zarr_path = self._dir / f"{self._name}.zarr"
+        self._index_path = shard_index(path, shard_id)
+        self._zarr_path = self._index_path.with_suffix(".zarr")
         if self._index_path.exists():
             raise FileExistsError(f"{self._index_path} is complete already; write another shard or remove it")
         self._schema = schema

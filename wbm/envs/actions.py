@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from wbm.envs.config import ActionConfig
-from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
+from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, quat_turn, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
@@ -95,7 +96,7 @@ class WbcAction:
         self.velocity.copy_((pos - self.pos) * (c.feed_forward / self.period))
         self.pos.copy_(pos)
         turned = quat_mul(self.quat, quat_exp(c.ee_turn * action[:, 3:6]))
-        turn = _shorten(quat_log(quat_mul(quat_conj(ee_quat), turned)), c.ee_turn_leash)
+        turn = _shorten(quat_turn(ee_quat, turned), c.ee_turn_leash)
         quat = quat_mul(ee_quat, quat_exp(turn))
         self.quat.copy_(quat / quat.norm(dim=-1, keepdim=True))
 
@@ -156,3 +157,12 @@ def make_action(
 def _shorten(v: Tensor, limit: float) -> Tensor:
     """Vectors [N,3] no longer than `limit`."""
     return v * (limit / v.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
+
+
+def joint_limits(robot: RobotModel, device: str) -> tuple[Tensor, Tensor]:
+    """Lower and upper joint limits [32] as tensors."""
+    assert len(robot.q_min) == joints.NUM_JOINTS
+    return (
+        torch.tensor(np.asarray(robot.q_min), dtype=torch.float32, device=device),
+        torch.tensor(np.asarray(robot.q_max), dtype=torch.float32, device=device),
+    )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
 
 def episode_uniforms(seed: int, episodes: np.ndarray, count: int) -> np.ndarray:
@@ -35,3 +37,20 @@ class Columns:
         self.names[name] = slice(self.count, self.count + width)
         self.count += width
         return self.names[name]
+
+
+class Stream:
+    """Endless rows of uniforms [columns.count], each keyed by (seed, its place in the stream).
+
+    Attributes:
+        drawn: rows given out so far.
+    """
+
+    def __init__(self, seed: int, columns: Columns, device: str) -> None:
+        self.seed, self.columns, self.device, self.drawn = seed, columns, device, 0
+
+    def draw(self, count: int) -> Tensor:
+        """The next `count` rows."""
+        rows = episode_uniforms(self.seed, np.arange(self.drawn, self.drawn + count), self.columns.count)
+        self.drawn += count
+        return torch.from_numpy(rows).to(self.device)

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from wbm.envs.actions import joint_limits
 from wbm.envs.grasp_env import STARTS, GraspEnv
 from wbm.envs.outcome import REASONS, SUCCESS
-from wbm.envs.perception import MIN_TARGET_PIXELS, Perception, Sight, joint_limits
+from wbm.envs.perception import MIN_TARGET_PIXELS, Perception, Sight
 from wbm.robot import joints
 from wbm.robot.schema import PolicySchema, to_increment, to_target
 
@@ -108,12 +109,15 @@ class StudentDriver:
         self.policy, self.schema = policy, schema
         self.low, self.high = joint_limits(env.robot, env.device)
 
+    def target(self, env: GraspEnv, sight: Sight) -> Tensor:
+        """Joint targets [N,32], within their limits, for what is seen."""
+        action = torch.as_tensor(self.policy(sight.obs), dtype=torch.float32, device=env.device)
+        return to_target(torch, env.state.q.float(), action, self.schema.action).clamp(self.low, self.high)
+
     def step(self, env: GraspEnv, sight: Sight | None) -> tuple[Tensor, Tensor, Tensor, dict]:
         """Act on what is seen."""
         assert sight is not None
-        action = torch.as_tensor(self.policy(sight.obs), dtype=torch.float32, device=env.device)
-        target = to_target(torch, env.state.q.float(), action, self.schema.action)
-        return env.step_targets(target.clamp(self.low, self.high))
+        return env.step_targets(self.target(env, sight))
 
 
 class EpisodeRunner:

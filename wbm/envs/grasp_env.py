@@ -9,6 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from wbm.artifacts.episode_layout import STARTS
 from wbm.control.config import WbcConfig
 from wbm.control.wbc import WholeBodyController
 from wbm.envs import rewards
@@ -27,8 +28,7 @@ from wbm.robot.model import RobotModel
 from wbm.sim.config import SimConfig
 from wbm.sim.simulation import make_simulation
 
-STARTS = ("full", "pregrasp", "scattered")
-FULL, AT_PREGRASP, SCATTERED = range(3)
+FULL, AT_PREGRASP, SCATTERED = range(len(STARTS))
 
 _LIVE = ("episode", "scene", "scene_weight", "elapsed", "ctrl", "previous", "posture")
 
@@ -262,8 +262,10 @@ class GraspEnv:
         self._fix_neck()
 
     def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, dict]:
-        executed = self.ctrl if self.noise is None else self.ctrl + self.noise
-        executed = executed.clone() if self.override is None else self.override
+        if self.override is not None:
+            executed = self.override
+        else:
+            executed = self.ctrl.clone() if self.noise is None else self.ctrl + self.noise
         self.sim.ctrl.copy_(executed)
         self.sim.step(self.decimation)
         self.elapsed += 1

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
 from wbm.control.links import LinkPoses
-from wbm.robot import joints
 from wbm.robot.model import RobotModel
 from wbm.robot.proprio import FRAMES, proprioception
 from wbm.robot.schema import PolicySchema
@@ -139,12 +137,3 @@ class Perception:
         delta = point - pos
         c, s = 1 - 2 * quat[:, 3] ** 2, 2 * quat[:, 0] * quat[:, 3]
         return torch.stack([c * delta[:, 0] + s * delta[:, 1], -s * delta[:, 0] + c * delta[:, 1], delta[:, 2]], -1)
-
-
-def joint_limits(robot: RobotModel, device: str) -> tuple[Tensor, Tensor]:
-    """Lower and upper joint limits [32] as tensors."""
-    assert len(robot.q_min) == joints.NUM_JOINTS
-    return (
-        torch.tensor(np.asarray(robot.q_min), dtype=torch.float32, device=device),
-        torch.tensor(np.asarray(robot.q_max), dtype=torch.float32, device=device),
-    )

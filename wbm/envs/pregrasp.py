@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -12,12 +11,12 @@ from torch import Tensor
 from wbm.control.config import WbcConfig
 from wbm.control.planner import Target, pregrasp_poses
 from wbm.control.wbc import WholeBodyController
-from wbm.envs.actions import HAND_CLOSED, HAND_OPEN
+from wbm.envs.actions import HAND_CLOSED, HAND_OPEN, joint_limits
 from wbm.envs.binding import SceneTable
 from wbm.envs.config import EnvConfig, ScatterConfig
-from wbm.envs.draws import Columns, episode_uniforms
+from wbm.envs.draws import Columns, Stream
 from wbm.envs.randomization import scaled
-from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, rotate
+from wbm.envs.rotations import quat_exp, quat_mul, quat_turn, rotate
 from wbm.robot import joints
 from wbm.robot.model import RobotModel
 
@@ -114,16 +113,16 @@ def solve_starts(
     room = torch.full((count, keep), -torch.inf, device=device)
     own = torch.zeros(count, keep, device=device)
     solvers: dict[int, _Solver] = {}
-    columns, tried = Columns(), 0
+    columns = Columns()
     jitter, stand = columns.add("jitter", 7), columns.add("stand", 3)
+    uniforms = Stream(seed, columns, device)
     for _ in range(rounds):
         # Every scene that lacks starts gets as many candidates as it lacks, interleaved so that all scenes progress.
         lacking = torch.cat([(found < keep - k).nonzero().squeeze(1) for k in range(keep)])
         for first in range(0, len(lacking), batch):
             part = lacking[first : first + batch]
-            u = torch.from_numpy(episode_uniforms(seed, np.arange(tried, tried + len(part)), columns.count)).to(device)
-            first_choice = torch.arange(tried, tried + len(part), device=device) < count
-            tried += len(part)
+            first_choice = torch.arange(len(part), device=device) < count - uniforms.drawn
+            u = uniforms.draw(len(part))
             pos, quat = grasp_poses(table, part, grasp, cfg, u[:, jitter], (~first_choice).float())
             base = stand_poses(table.base[part], torch.where(first_choice.unsqueeze(1), 0.5, u[:, stand]))
             size = min(n for n in (*FEW, max(batch, *FEW)) if n >= len(part))
@@ -177,19 +176,17 @@ def scatter_starts(
     solver = _Solver(table, robot, wbc_cfg, batch, device)
     offset = torch.zeros(joints.NUM_JOINTS, device=device)
     offset[:2], offset[2], offset[joints.ARM], offset[joints.NECK] = cfg.base, cfg.yaw, cfg.arm, cfg.neck
-    low = torch.tensor(robot.q_min, dtype=torch.float32, device=device)
-    high = torch.tensor(robot.q_max, dtype=torch.float32, device=device)
-    columns, tried = Columns(), 0
+    low, high = joint_limits(robot, device)
+    columns = Columns()
     along, aside = columns.add("along"), columns.add("aside", joints.NUM_JOINTS)
     closure, closed = columns.add("closure"), torch.tensor(HAND_CLOSED, device=device)
+    uniforms = Stream(seed, columns, device)
     for place in range(cfg.per_scene):
         waiting = everything
         for _ in range(rounds):
             left = []
             for part in waiting.split(batch):
-                u = episode_uniforms(seed, np.arange(tried, tried + len(part)), columns.count)
-                u = torch.from_numpy(u).to(device)
-                tried += len(part)
+                u = uniforms.draw(len(part))
                 way = table.q_start[part] + u[:, along] * (goal[part] - table.q_start[part])
                 q = (way + offset * (2.0 * u[:, aside] - 1.0)).clamp(low, high)
                 hand = goal[part][:, joints.HAND]
@@ -225,7 +222,7 @@ class _Solver:
         self.home = torch.tensor(robot.q_home, dtype=torch.float32, device=device)
         self.home[joints.HAND] = torch.tensor(HAND_OPEN, device=device)
         self.home[joints.NECK] = torch.tensor(NECK_ASIDE, device=device)
-        self.home.clamp_(*(torch.tensor(q, dtype=torch.float32, device=device) for q in (robot.q_min, robot.q_max)))
+        self.home.clamp_(*joint_limits(robot, device))
         self.body = torch.as_tensor(joints.WBC, device=device)
 
     def solve(self, scenes: Tensor, pos: Tensor, quat: Tensor, base: Tensor, iterations: int) -> tuple[Tensor, ...]:
@@ -244,7 +241,7 @@ class _Solver:
             self.q[:, self.body] = self.q_target
         self.controller.step()
         error = (self.frame_pos[:, self.ee] - self.pos).norm(dim=-1)
-        angle = quat_log(quat_mul(quat_conj(self.frame_quat[:, self.ee]), self.quat)).norm(dim=-1)
+        angle = quat_turn(self.frame_quat[:, self.ee], self.quat).norm(dim=-1)
         good = (error < 0.02) & (angle < 0.15) & (self.distance > 0.005)
         return self.q[:size].clone(), good[:size].clone(), self.distance[:size].clone()
 

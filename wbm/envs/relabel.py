@@ -7,10 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from wbm.envs.episodes import StudentDriver
 from wbm.envs.grasp_env import GraspEnv
-from wbm.envs.perception import Sight, joint_limits
+from wbm.envs.perception import Sight
 from wbm.envs.whole_body import FREE, WholeBodyEnv
-from wbm.robot.schema import PolicySchema, to_target
+from wbm.robot.schema import PolicySchema
 
 
 class DemonstrationDriver:
@@ -58,17 +59,14 @@ class RelabelDriver:
         env: GraspEnv,
         schema: PolicySchema,
     ) -> None:
-        self.student, self.teacher, self.schema = student, teacher, schema
-        self.low, self.high = joint_limits(env.robot, env.device)
+        self.student, self.teacher = StudentDriver(student, env, schema), teacher
 
     def step(self, env: GraspEnv, sight: Sight | None) -> tuple[Tensor, Tensor, Tensor, dict]:
         """Act once in all environments."""
         assert sight is not None and isinstance(env, WholeBodyEnv)
         env.find_phase()
         env.resume(torch.ones_like(env.phase, dtype=torch.bool))
-        action = torch.as_tensor(self.student(sight.obs), dtype=torch.float32, device=env.device)
-        target = to_target(torch, env.state.q.float(), action, self.schema.action)
-        env.override = target.clamp(self.low, self.high)
+        env.override = self.student.target(env, sight)
         try:
             return env.step(self.teacher(env.obs))
         finally:

@@ -41,6 +41,11 @@ def quat_log(q: Tensor) -> Tensor:
     return scale * q[..., 1:]
 
 
+def quat_turn(a: Tensor, b: Tensor) -> Tensor:
+    """Rotation vector [...,3] of the shorter way from `a` to `b`, in the frame of `a`, rad."""
+    return quat_log(quat_mul(quat_conj(a), b))
+
+
 def rotate(q: Tensor, v: Tensor) -> Tensor:
     """Rotate vectors [...,3] by q [...,4]."""
     u = q[..., 1:].expand_as(v)

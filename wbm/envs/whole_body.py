@@ -11,7 +11,7 @@ from torch import Tensor
 
 from wbm.control.base_path import BaseMap, Obstacles, base_path
 from wbm.envs.grasp_env import AT_PREGRASP, FULL, SCATTERED, GraspEnv
-from wbm.envs.rotations import quat_conj, quat_exp, quat_log, quat_mul, quat_to_mat, rotate
+from wbm.envs.rotations import quat_conj, quat_exp, quat_mul, quat_to_mat, quat_turn, rotate
 from wbm.robot import joints
 
 FREE, CONTACT = 0, 1
@@ -171,14 +171,17 @@ class WholeBodyEnv(GraspEnv):
         _, angle = self._errors(self._goal_pos, self._goal_quat)
         lost = (s.lifted == 0) & ((ahead < -LOST) | (aside > LOST))
         begun = (ahead > -GOOD_PREGRASP[0]) & (aside < BEGUN[0]) & (angle < BEGUN[1]) & (self.phase == FREE) & ~lost
-        self._contact_since[begun] = self.elapsed[begun]
-        self.posture[begun] = s.q[begun][:, self._body].to(self.posture)
-        self.phase[begun], self.phase[lost] = CONTACT, FREE
+        self._enter_contact(begun)
+        self.phase[lost] = FREE
+
+    def _enter_contact(self, which: Tensor) -> None:
+        """Begin the contact-rich phase in environments `which` (indices or flags), with the posture that they have."""
+        self.phase[which], self._contact_since[which] = CONTACT, self.elapsed[which]
+        self.posture[which] = self.state.q[which][:, self._body].to(self.posture)
 
     def _errors(self, pos: Tensor, quat: Tensor) -> tuple[Tensor, Tensor]:
         s = self.state
-        turn = quat_log(quat_mul(quat_conj(s.ee_quat), quat))
-        return (pos - s.ee_pos_w).norm(dim=-1), turn.norm(dim=-1)
+        return (pos - s.ee_pos_w).norm(dim=-1), quat_turn(s.ee_quat, quat).norm(dim=-1)
 
     def _waypoint(self) -> Tensor:
         """Where the hand's target goes next [N,3]: to the pre-grasp, behind it while it is off the line of approach.
@@ -188,7 +191,7 @@ class WholeBodyEnv(GraspEnv):
         ahead = rotate(self._goal_quat, torch.tensor([0.0, 0.0, 1.0], device=self.device).expand(self.num_envs, 3))
         off = self.action.pos - self._goal_pos
         aside = (off - (off * ahead).sum(-1, keepdim=True) * ahead).norm(dim=-1)
-        angle = quat_log(quat_mul(quat_conj(self.action.quat), self._goal_quat)).norm(dim=-1)
+        angle = quat_turn(self.action.quat, self._goal_quat).norm(dim=-1)
         back = ASIDE[0] * (aside - LINE[0]).clamp(min=0.0) + ASIDE[1] * (angle - LINE[1]).clamp(min=0.0)
         return self._goal_pos - back.clamp(max=self.cfg.approach_back).unsqueeze(1) * ahead
 
@@ -205,8 +208,7 @@ class WholeBodyEnv(GraspEnv):
         settled |= good & ((self.elapsed - self._close_since) * self.period > LINGER)
         ids = (free & settled).nonzero().squeeze(1)
         if len(ids):
-            self.phase[ids], self._contact_since[ids] = CONTACT, self.elapsed[ids]
-            self.posture[ids] = s.q[ids][:, self._body].to(self.posture)
+            self._enter_contact(ids)
             self.action.reset(ids, s.q[ids].float(), s.ee_pos_w[ids], s.ee_quat[ids])
 
     def _approach(self, free: Tensor) -> None:
@@ -217,7 +219,7 @@ class WholeBodyEnv(GraspEnv):
         ahead = _towards(term.pos, goal, speed * self.period)
         ahead = s.ee_pos_w + _towards(torch.zeros_like(ahead), ahead - s.ee_pos_w, c.approach_leash)
         near = (s.ee_pos_w - self._goal_pos).norm(dim=-1, keepdim=True) < SEEN_FROM
-        turn = quat_log(quat_mul(quat_conj(s.ee_quat), torch.where(near, self._goal_quat, self._far_quat)))
+        turn = quat_turn(s.ee_quat, torch.where(near, self._goal_quat, self._far_quat))
         turned = quat_mul(s.ee_quat, quat_exp(_towards(torch.zeros_like(turn), turn, c.approach_turn * TURN_AHEAD)))
         keep = (~free).unsqueeze(1)
         term.velocity.copy_(torch.where(keep, term.velocity, (ahead - term.pos) / self.period))

@@ -50,6 +50,12 @@ def masked_softmax(logits: Tensor, valid: Tensor) -> Tensor:
     return torch.softmax(torch.where(valid > 0, logits, _FAR), dim=1) * valid
 
 
+def products(v: Tensor) -> Tensor:
+    """xx, yy, zz, xy, xz and yz [...,6] of vectors [...,3]."""
+    x, y, z = v.unbind(-1)
+    return torch.stack([x * x, y * y, z * z, x * y, x * z, y * z], dim=-1)
+
+
 def local_shape(xyz: Tensor, rgb: Tensor, valid: Tensor, radius: float) -> Tensor:
     """What surrounds each point within `radius` metres: density, mean offset, covariance and mean colour.
 
@@ -71,13 +77,10 @@ def local_shape(xyz: Tensor, rgb: Tensor, valid: Tensor, radius: float) -> Tenso
     left = torch.cat([2.0 * scaled, 1.0 - square, -one], dim=-1)
     right = torch.cat([scaled, one, square], dim=-1)
     weight = torch.relu(left @ right.transpose(1, 2))
-    x, y, z = scaled.unbind(-1)
-    moments = torch.stack([x * x, y * y, z * z, x * y, x * z, y * z], dim=-1)
-    sums = weight @ (torch.cat([one, scaled, moments, rgb], dim=-1) * valid)
+    sums = weight @ (torch.cat([one, scaled, products(scaled), rgb], dim=-1) * valid)
     count = sums[..., :1]
     mean = sums[..., 1:] / count.clamp(min=0.5)  # a valid point counts itself
-    mx, my, mz = mean[..., :3].unbind(-1)
-    outer = torch.stack([mx * mx, my * my, mz * mz, mx * my, mx * mz, my * mz], dim=-1)
+    outer = products(mean[..., :3])
     return torch.cat([0.1 * count, mean[..., :3] - scaled, mean[..., 3:9] - outer, mean[..., 9:]], dim=-1) * valid
 
 
@@ -174,7 +177,7 @@ class Tokenizer(nn.Module):
         target = [selected - self.centre_b * any_valid, selected_ee, masked - self.centre_b * has_mask, masked_ee]
         # The target's points: those of the mask or, without one, those that are selected.
         picked = weights[..., :1] / weights[..., :1].amax(1, keepdim=True).clamp(min=1e-6)
-        points = torch.where(has_mask.unsqueeze(1) > 0, mask, picked * valid)
+        on_target = torch.where(has_mask.unsqueeze(1) > 0, mask, picked * valid)
         centre = torch.where(has_mask > 0, masked, selected)
         # Where the camera has it: what the neck is to mend.
         camera_rot = rotation_from_6d(proprio[:, _CAMERA_ROT : _CAMERA_ROT + 6])
@@ -182,14 +185,13 @@ class Tokenizer(nn.Module):
         sight = from_camera.squeeze(1) / from_camera.norm(dim=-1).clamp(min=0.05) * any_valid
         about_b = xyz - centre.unsqueeze(1)
         about_ee = about_b @ ee_rot
-        x, y, z = (about_ee / _SPREAD).unbind(-1)
-        moments = torch.stack([x * x, y * y, z * z, x * y, x * z, y * z], dim=-1).clamp(-9.0, 9.0)
-        moments = (points * moments).sum(1) / points.sum(1).clamp(min=1.0)
+        moments = products(about_ee / _SPREAD).clamp(-9.0, 9.0)
+        moments = (on_target * moments).sum(1) / on_target.sum(1).clamp(min=1.0)
         sides = torch.cat([about_ee, -about_ee], dim=-1).clamp(-0.15, 0.15) / _EXTENT
-        extent = (points * sides).max(dim=1).values
+        extent = (on_target * sides).max(dim=1).values
         target = torch.cat([*target, has_mask, 10.0 * spread, 3.0 * sight, moments, extent], dim=-1)
-        shape = torch.cat([about_ee / _OBJECT, about_b / _OBJECT, points], dim=-1).clamp(-3.0, 3.0)
-        shape = self.shaped(masked_max(self.shape(shape * valid), points))
+        shape = torch.cat([about_ee / _OBJECT, about_b / _OBJECT, on_target], dim=-1).clamp(-3.0, 3.0)
+        shape = self.shaped(masked_max(self.shape(shape * valid), on_target))
         tokens.append(torch.stack([self.target(target), text, shape], dim=1))
 
         if self.cfg.lidar_tokens:
